@@ -95,7 +95,7 @@ test-app: env-dev
 test-kernels: env-dev
 	$(PYTESTS) tests/kernels
 	@# make test runs at the highest level
-	@for level in $$($(BIN)/python -c "from mphdrr.core.projector.backends import cpu; print(*cpu.levels()[:-1])"); do \
+	@for level in $$($(BIN)/python -c "from mphdrr.core.rays.backends import cpu; print(*cpu.levels()[:-1])"); do \
 		echo "accuracy of $$level"; MPHDRR_CPU_LEVEL=$$level $(BIN)/python -m pytest -k cpu tests/core/test_projector.py \
 		tests/core/test_emission.py tests/core/test_emission_gradients.py tests/core/test_geometry_gradients.py tests/core/test_hole_by_depth.py || exit 1; done
 
@@ -123,6 +123,6 @@ env-peers:
 	$(ENVIRONMENT) --extras peers --torch "$(TORCH)"
 
 clean:
-	rm -f core/projector/backends/kernels/*.so core/projector/backends/kernels/*.dylib core/projector/backends/kernels/*.dll
+	rm -f core/rays/backends/kernels/*.so core/rays/backends/kernels/*.dylib core/rays/backends/kernels/*.dll
 	rm -rf out dist build wheels .venv* *.egg-info .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis
 	find . -name __pycache__ -prune -exec rm -rf {} +

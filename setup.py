@@ -21,7 +21,7 @@ def stub_of(source):
     """Give what says the names of a package's public interface to type checkers: imports count if they name them twice."""
     body = ast.parse(source).body
     body = next((node.body for node in body if isinstance(node, ast.If)), body)  # imports for type checkers alone
-    imports = [node for node in body if isinstance(node, ast.ImportFrom)]
+    imports = [node for node in body if isinstance(node, ast.ImportFrom) and node.module != "lazy"]
     lines = [
         f"from {'.' * node.level}{node.module or ''} import {name.name} as {name.name}\n"
         for node in imports

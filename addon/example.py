@@ -1,4 +1,4 @@
-"""The examples: the bundled scanner around a phantom, which it or X-ray tubes beside it have projected, in one step."""
+"""Examples: the bundled scanner around a phantom, projected by it or by X-ray tubes beside it, in one step."""
 
 from typing import Any
 
@@ -19,85 +19,85 @@ from .runs import rendering, runs
 from .scanner import scanner
 
 _VOXELS, _PIXELS = 128, 128
-_VIEW = Euler((1.05, 0.0, 0.95))  # from above, into the opening of the rings
+_VIEW = Euler((1.05, 0.0, 0.95))  # view from above, into the opening of the rings
 EXAMPLES = (
     ("DERENZO", "Derenzo Phantom", "What 80 modules see of a Derenzo phantom"),
     ("XRAY", "X-ray Inside SPECT", "CT by 24 X-ray tubes above the modules, SPECT with it, dose"),
 )
-"""Identifier, label and description of each."""
+"""Identifier, label and description of each example."""
 _RING: dict[str, Any] = {
     "source_radius": 600, "panel_radius": 480, "panel_size": (864, 648), "shape": (96, 128), "kvp": 120, "mas": 0.5,
 }  # fmt: skip
-"""Wide panels: each source sees the whole torso, and all of its grid lies before them."""
-_MIDDLE = (35.0, -30.0, -30.0)  # of the torso, whose heart is at the isocentre, mm
+"""X-ray ring with panels so wide that each source sees the whole torso, with all of its grid before the panels."""
+_TORSO_CENTER = (35.0, -30.0, -30.0)  # mm, with the heart at the isocentre
 _STARTUP = ("Cube", "Light", "Camera")
 
 
 def example_job(context: bpy.types.Context, of_xrays: bool = False, replace: bool = False) -> jobs.Job:
-    """The job that puts the example into the context's scene and shows it: `EXAMPLES`' first, or that of X rays.
+    """Return the job that puts an example into the context's scene and shows it: the first of `EXAMPLES`, or that of X rays.
 
-    `replace`: also in place of a changed one.
+    With `replace`, it also replaces a changed example.
     """
     scene, pinholes = context.scene, read_system(EXAMPLE)
     system: Scanner = xray_ring(**_RING) if of_xrays else pinholes
     kind, name = ("torso", "Cardiac Torso") if of_xrays else ("derenzo", "Derenzo")
     pose = np.eye(4) if of_xrays else euler_pose(*np.deg2rad(EULER_DEGREES))
-    # Of activity beside the modules' field of view, which few of them see, the voxels at its edge would shine.
-    without = dict.fromkeys(("liver", "lung", "body"), 0.0) if of_xrays else {}
-    settings = phantom_properties.plain_settings(kind, voxels=_VOXELS, **without)
-    adding = phantoms.adding(settings, name, pose, attenuation=of_xrays)
-    given: dict[str, Any] = {"system.file": str(EXAMPLE), "detector.rows": _PIXELS, "detector.columns": _PIXELS}
+    # Few modules see activity beside their field of view: a reconstruction would show bright voxels at the field's edge.
+    removed = dict.fromkeys(("liver", "lung", "body"), 0.0) if of_xrays else {}
+    settings = phantom_properties.plain_settings(kind, voxels=_VOXELS, **removed)
+    adding = phantoms.add_phantom_job(settings, name, pose, attenuation=of_xrays)
+    entries: dict[str, Any] = {"system.file": str(EXAMPLE), "detector.rows": _PIXELS, "detector.columns": _PIXELS}
     if of_xrays:
-        given = {"model.kind": "spectral", "volume.energy": settings.phantom().mu_energy, "noise.seed": 1}
-    recipe = rendering.of_phantom(Recipe(given), settings, pose)
-    scene_uid, path = scene.session_uid, rendering.run_path(scene)
+        entries = {"model.kind": "spectral", "volume.energy": settings.phantom().mu_energy, "noise.seed": 1}
+    recipe = rendering.with_settings(Recipe(entries), settings, pose)
+    scene_uid, path = scene.session_uid, rendering.new_run_path(scene)
     display = Display("grey", "log") if of_xrays else scene.mphdrr_display.display()
 
     def work(progress: Progress) -> Any:
         stages = stages_of(progress)
-        stored = adding.work(progress)
-        (run,) = run_recipe(recipe, system, stored[-1].volume, stages=stages)
-        return stored, run, rendering.kept(run, path, display, stages)
+        stored_volumes = adding.work(progress)
+        (run,) = run_recipe(recipe, system, stored_volumes[-1].volume, stages=stages)
+        return stored_volumes, run, rendering.write_and_draw(run, path, display, stages)
 
     def finish(result: Any) -> jobs.Finishing:
-        stored, run, made = result
-        scene = jobs.scene_again(scene_uid, "the projections are")
+        stored_volumes, run, pictures = result
+        scene = jobs.require_scene(scene_uid, "the projections are")
         if of_xrays:
             scene.mphdrr_display.colors, scene.mphdrr_display.scale = "GREY", "LOG"
-        mosaic = yield from images.storing(run, made)
+        mosaic = yield from images.store_images(run, pictures)
         collection = scanner.build_scanner(scene, pinholes, replace=replace)
         yield None
         if of_xrays:
             collection = scanner.build_scanner(scene, system, "X-ray", replace=replace)
             yield None
-        adding.finish(stored)
+        adding.finish(stored_volumes)
         yield None
-        rendering.place(scene, run, collection)
+        rendering.show_planes(scene, run, collection)
         projected = phantoms.with_children(bpy.context.object)[-1]
-        runs.add(scene, run, path, rendering.taken_over(scene, run, projected), collection)
+        runs.add_run(scene, run, path, rendering.adopt_settings(scene, run, projected), collection)
         if of_xrays:
-            _ask_for_spect(scene)
+            _set_spect(scene)
         _hide_startup(scene, collection)
         studio.light(scene)
         images.show_below(mosaic, bpy.context)
         scanner.set_up_scene(scene, collection, _VIEW.to_quaternion())
-        seers = "X-ray tubes" if of_xrays else "modules"
-        return f"Loaded the example: {len(system)} {seers} and what they see of a {name} phantom"
+        sources = "X-ray tubes" if of_xrays else "modules"
+        return f"Loaded the example: {len(system)} {sources} and what they see of a {name} phantom"
 
     return jobs.Job("Loading the example", work, finish, lambda: path.unlink(missing_ok=True))
 
 
-def _ask_for_spect(scene: bpy.types.Scene) -> None:
+def _set_spect(scene: bpy.types.Scene) -> None:
     """Set the panels for SPECT of the torso in seconds, by ideal holes, and for the CT before it."""
     for name, value in {"hole": "POINT", "pixel_points": 4, "width": 48, "height": 48}.items():
         setattr(scene.mphdrr_projections, name, value)
-    settings = {"method": "TV", "fitted": "TV", "weight": 0.5, "voxels": 56, "spacing": 8.0, "center": _MIDDLE}
+    settings = {"method": "TV", "fitted": "TV", "weight": 0.5, "voxels": 56, "spacing": 8.0, "center": _TORSO_CENTER}
     for name, value in settings.items():
         setattr(scene.mphdrr_reconstruction, name, value)
 
 
 def _hide_startup(scene: bpy.types.Scene, collection: bpy.types.Collection) -> None:
-    """Hide what Blender's own startup file has in the scene, and look through a module instead of its camera."""
+    """Hide the objects of Blender's own startup file, and look through a module instead of its camera."""
     for name in _STARTUP:
         item = scene.objects.get(name)
         if item is not None:

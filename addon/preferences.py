@@ -1,4 +1,4 @@
-"""Preferences > Add-ons > mphDRR: what computes here and why, threads, the cache, the example, the website."""
+"""Preferences > Add-ons > mphDRR: backends and why others are missing, threads, the cache, the example, the website."""
 
 from __future__ import annotations
 
@@ -14,36 +14,37 @@ from bpy.props import BoolProperty, IntProperty
 
 from ..core import cache
 from ..core.memory import readable_size
-from ..core.projector import backends, parallel
+from ..core.rays import backends, parallel
 from .blender import storage
 from .blender.layouts import invoking
 
-PIE, PIE_KEYMAP = "MPHDRR_MT_module", "Object Mode"  # the menu on a key, and Blender's keymap with that
-PACKAGE = __package__.rpartition(".")[0]  # "mphdrr", or "bl_ext.<repo>.mphdrr" when installed as an extension
+PIE, PIE_KEYMAP = "MPHDRR_MT_module", "Object Mode"  # the menu on a key, and Blender's keymap with that key
+PACKAGE = __package__.rpartition(".")[0]  # "mphdrr", or "bl_ext.<repo>.mphdrr" for an installed extension
 
 
-def _set(self: MPHDRR_Preferences, context: bpy.types.Context) -> None:
+def _apply(self: MPHDRR_Preferences, context: bpy.types.Context) -> None:
+    """Apply edited preferences."""
     parallel.set_usual_threads(self.threads or None)
     storage.copies = self.copies
 
 
 class MPHDRR_Preferences(bpy.types.AddonPreferences):
-    """What holds for all scenes."""
+    """Settings for all scenes."""
 
     bl_idname = PACKAGE
 
     threads: IntProperty(
-        name="Threads", description="Processor threads that projections use where the panel does not say; 0: all",
-        default=0, min=0, soft_max=64, update=_set,
+        name="Threads", description="Processor threads for projections unless the panel sets them; 0: all",
+        default=0, min=0, soft_max=64, update=_apply,
     )  # fmt: skip
     copies: BoolProperty(
         name="Save As Copies Files", description="Copy the voxels and runs of a scene into the folder beside the new "
         ".blend; else both .blend files share those of the old one",
-        default=True, update=_set,
+        default=True, update=_apply,
     )  # fmt: skip
 
     def draw(self, context: bpy.types.Context) -> None:
-        """Called by Blender."""
+        """Draw the preferences; called by Blender."""
         layout = self.layout
         row = invoking(layout.row())
         row.operator("mphdrr.load_example", icon="PLAY")
@@ -52,18 +53,18 @@ class MPHDRR_Preferences(bpy.types.AddonPreferences):
             row.operator("wm.url_open", text="Website and Documentation", icon="URL").url = website()
         box = layout.box()
         box.label(text="What computes the projections:")
-        names, states = (part := box.split(factor=0.2)).column(align=True), part.column(align=True)
+        names, states = (split := box.split(factor=0.2)).column(align=True), split.column(align=True)
         for name, state in backends.states().items():
             names.label(text=backends.BACKENDS[name].label)
             states.label(text=state[:1].upper() + state[1:])
         layout.use_property_split = True
         layout.prop(self, "threads", text="Threads" if self.threads else "Threads (0: all)")
         layout.prop(self, "copies")
-        known = context.window_manager.keyconfigs.user
-        keymap = known.keymaps.get(PIE_KEYMAP)
+        keyconfig = context.window_manager.keyconfigs.user
+        keymap = keyconfig.keymaps.get(PIE_KEYMAP)
         for item in keymap.keymap_items if keymap else ():
             if getattr(item.properties, "name", "") == PIE:
-                rna_keymap_ui.draw_kmi([], known, keymap, item, layout, 0)
+                rna_keymap_ui.draw_kmi([], keyconfig, keymap, item, layout, 0)
         folder = own_folder()
         if folder is not None:
             row = layout.row()
@@ -73,7 +74,7 @@ class MPHDRR_Preferences(bpy.types.AddonPreferences):
 
 
 def own_folder(name: str = "cache") -> Path | None:
-    """A folder in the extension's own one for what can be made again; None where this is no installed extension."""
+    """Return a folder in the extension's own one for files that can be made again; None without an installed extension."""
     try:
         return Path(bpy.utils.extension_path_user(PACKAGE, path=name))
     except ValueError:
@@ -81,13 +82,13 @@ def own_folder(name: str = "cache") -> Path | None:
 
 
 def cache_size() -> int:
-    """Bytes of the files in `own_folder`."""
+    """Return the bytes of the files in `own_folder`."""
     folder = own_folder()
     return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file()) if folder else 0
 
 
 def clean_cache() -> str:
-    """Delete what is in `own_folder`; returns the line to report."""
+    """Delete the files in `own_folder`, and return the line to report."""
     size, folder = cache_size(), own_folder()
     if folder is not None:
         shutil.rmtree(folder, ignore_errors=True)  # a library that is loaded cannot be deleted on Windows
@@ -96,14 +97,14 @@ def clean_cache() -> str:
 
 @functools.cache
 def website() -> str:
-    """The extension's website, as its manifest says; "" for none."""
+    """Return the extension's website from its manifest; "" for none."""
     manifest = Path(__file__).parents[1] / "blender_manifest.toml"
     return tomllib.loads(manifest.read_text(encoding="utf-8")).get("website", "") if manifest.is_file() else ""
 
 
 def apply() -> None:
-    """Do as the preferences say, when the extension is enabled."""
+    """Apply the preferences when the extension is enabled."""
     folder, addon = own_folder(), bpy.context.preferences.addons.get(PACKAGE)
     cache.keep_in(folder)
     if addon is not None and addon.preferences is not None:
-        _set(addon.preferences, bpy.context)
+        _apply(addon.preferences, bpy.context)

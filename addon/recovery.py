@@ -1,4 +1,4 @@
-"""Volumes whose files are gone, as after a crash that took the temporary folder: those with a recipe are made again."""
+"""Recovery of volumes whose files are gone, as after a crash that took the temporary folder, by making them again."""
 
 from collections.abc import Generator
 from typing import Any
@@ -13,53 +13,54 @@ from .scanner import maps
 from .volumes import volumes
 
 
-def missing(scene: bpy.types.Scene) -> tuple[list[bpy.types.Object], list[bpy.types.Object]]:
-    """A scene's volumes whose files are missing: phantoms and maps, which can be made again, and the others."""
-    gone = set(storage.missing_volumes())
-    found = [item for item in volumes.volume_objects(scene) if item.data in gone]
-    phantom = {item: phantoms.root_of(item) for item in found}
-    known = [item for item in found if phantom[item] is not None or maps.can_be_made_again(scene, item)]
-    again = dict.fromkeys(phantom[item] or item for item in known)
-    return list(again), [item for item in found if item not in known]
+def missing_volumes(scene: bpy.types.Scene) -> tuple[list[bpy.types.Object], list[bpy.types.Object]]:
+    """Return a scene's volumes whose files are missing: phantoms and maps, which can be made again, and all others."""
+    missing = set(storage.missing_volumes())
+    items = [item for item in volumes.volume_objects(scene) if item.data in missing]
+    phantom_of = {item: phantoms.owning_phantom(item) for item in items}
+    remakable = [item for item in items if phantom_of[item] is not None or maps.can_be_made_again(scene, item)]
+    to_remake = dict.fromkeys(phantom_of[item] or item for item in remakable)
+    return list(to_remake), [item for item in items if item not in remakable]
 
 
-def remaking(scene: bpy.types.Scene) -> jobs.Job:
-    """The job that makes the volumes with a recipe again, with which the others are named in a warning."""
-    again, others = missing(scene)
-    made: list[tuple[str, jobs.Job]] = []
-    for item in again:
+def remake_job(scene: bpy.types.Scene) -> jobs.Job:
+    """Return the job that makes phantoms and maps without files again; a warning names all other volumes without files."""
+    to_remake, irreplaceable = missing_volumes(scene)
+    named_jobs: list[tuple[str, jobs.Job]] = []
+    for item in to_remake:
         try:
-            job = phantoms.updating(item) if phantoms.settings_of(item) is not None else maps.again(scene, item)
-            made.append((item.name, job))
+            is_phantom = phantoms.settings_of(item) is not None
+            job = phantoms.update_phantom_job(item) if is_phantom else maps.remake_map_job(scene, item)
+            named_jobs.append((item.name, job))
         except InputError as error:
             warn(f"{item.name}: {error}")
-    if others:
-        warn(what_to_do(others))
-    if not made:
+    if irreplaceable:
+        warn(advice(irreplaceable))
+    if not named_jobs:
         raise InputError("no phantom or map misses its files, or none can be made again")
 
     def work(progress: Progress) -> list[Any]:
-        return [job.work(part_of(progress, k, len(made)) or progress) for k, (_, job) in enumerate(made)]
+        return [job.work(part_of(progress, k, len(named_jobs)) or progress) for k, (_, job) in enumerate(named_jobs)]
 
     def finish(results: list[Any]) -> Generator[None, None, str]:
-        for (_, job), result in zip(made, results, strict=True):
+        for (_, job), result in zip(named_jobs, results, strict=True):
             job.finish(result)
             yield
-        return f"Made {', '.join(name for name, _ in made)} again"
+        return f"Made {', '.join(name for name, _ in named_jobs)} again"
 
     return jobs.Job("Making volumes again", work, finish)
 
 
-def what_to_do(others: list[bpy.types.Object]) -> str:
-    """What the user can do about volumes without a recipe, in one line."""
-    return f"{', '.join(item.name for item in others)}: find the voxel files in a folder, or import again"
+def advice(items: list[bpy.types.Object]) -> str:
+    """Return advice, in a line, on volumes without settings whose files are missing."""
+    return f"{', '.join(item.name for item in items)}: find the voxel files in a folder, or import again"
 
 
 def after_load(*_: Any) -> None:
-    """Say which files are missing, and what to do."""
+    """Print which files are missing, and what the user can do."""
     for scene in bpy.data.scenes:
-        again, others = missing(scene)
-        for found, todo in ((again, "press Make Again"), (others, "Find Missing Volume Files, or import again,")):
-            if found:
-                names = ", ".join(item.name for item in found)
-                print(f"mphDRR: the voxel files of {names} are missing: {todo} in the Phantom panel")
+        to_remake, others = missing_volumes(scene)
+        for items, action in ((to_remake, "press Make Again"), (others, "Find Missing Volume Files, or import again,")):
+            if items:
+                names = ", ".join(item.name for item in items)
+                print(f"mphDRR: the voxel files of {names} are missing: {action} in the Phantom panel")

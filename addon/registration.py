@@ -1,4 +1,4 @@
-"""What the extension registers with Blender; the only file that imports operators and panels."""
+"""Registration of the extension with Blender; the only file that imports operators and panels."""
 
 import atexit
 import importlib
@@ -26,12 +26,12 @@ from .volumes import slices, volumes
 
 
 def _classes(module: ModuleType) -> list[Any]:
-    """The classes that Blender registers, its `MPHDRR_...`, of a module or of all modules of a package."""
+    """Return the classes that Blender registers, `MPHDRR_...`, of a module or of all modules of a package."""
     if hasattr(module, "__path__"):
-        names = [f"{module.__name__}.{found.name}" for found in pkgutil.iter_modules(module.__path__)]
+        names = [f"{module.__name__}.{info.name}" for info in pkgutil.iter_modules(module.__path__)]
         return [cls for name in names for cls in _classes(importlib.import_module(name))]
-    found = [cls for name, cls in vars(module).items() if name.startswith("MPHDRR_") and isinstance(cls, type)]
-    return [cls for cls in found if cls.__module__ == module.__name__]
+    classes = [cls for name, cls in vars(module).items() if name.startswith("MPHDRR_") and isinstance(cls, type)]
+    return [cls for cls in classes if cls.__module__ == module.__name__]
 
 
 CLASSES: tuple[Any, ...] = (
@@ -43,7 +43,7 @@ CLASSES: tuple[Any, ...] = (
     *sorted(_classes(panels), key=lambda cls: hasattr(cls, "bl_parent_id")),  # a panel after its parent
 )
 
-# Entries in Blender's own menus: operators with their texts.
+# Entries in Blender's own menus: texts by operator.
 ENTRIES = {
     bpy.types.TOPBAR_MT_file_import: {
         "mphdrr.import_geometry": "Pinhole Geometry (.xlsx)",
@@ -67,6 +67,8 @@ ENTRIES = {
 
 
 def _draw_entries(entries: dict[str, str]) -> Callable[..., None]:
+    """Return a function that draws entries of a menu."""
+
     def draw(menu: bpy.types.Menu, context: bpy.types.Context) -> None:
         layout = layouts.invoking(menu.layout)
         for operator, text in entries.items():
@@ -75,7 +77,7 @@ def _draw_entries(entries: dict[str, str]) -> Callable[..., None]:
     return draw
 
 
-# Menus of ours in Blender's own: name, text, icon.
+# The extension's menus in Blender's own: name, text, icon.
 SUBMENUS = {
     bpy.types.VIEW3D_MT_add: ("MPHDRR_MT_add", "mphDRR", "OUTLINER_DATA_VOLUME"),
     bpy.types.VIEW3D_MT_object: ("MPHDRR_MT_commands", "mphDRR", "OUTLINER_OB_CAMERA"),
@@ -84,59 +86,56 @@ SUBMENUS = {
 
 
 def _draw_submenu(name: str, text: str, icon: str) -> Callable[..., None]:
+    """Return a function that draws an entry which opens a menu."""
     return lambda menu, context: menu.layout.menu(name, text=text, icon=icon)
 
 
 def _draw_splash(menu: bpy.types.Menu, context: bpy.types.Context) -> None:
-    """An extension cannot bring an application template: Blender looks for these in its own folders only."""
+    """Draw the example's entry in the splash screen.
+
+    An extension cannot bring an application template: Blender looks for these in its own folders only.
+    """
     layouts.invoking(menu.layout).operator("mphdrr.load_example", text="mphDRR Example", icon="PLAY")
     menu.layout.separator()
 
 
 MENUS = [(menu, _draw_entries(entries)) for menu, entries in ENTRIES.items()]
-MENUS += [(bpy.types.STATUSBAR_HT_header, draw) for draw in (storage.draw_said, jobs.draw_status)]
+MENUS += [(bpy.types.STATUSBAR_HT_header, draw) for draw in (storage.draw_save_note, jobs.draw_status)]
 MENUS += [(menu, _draw_submenu(*submenu)) for menu, submenu in SUBMENUS.items()]
 MENUS.append((bpy.types.WM_MT_splash, _draw_splash))
-MENUS += [
-    (each, menus.draw_in_context_menu)
-    for each in (bpy.types.VIEW3D_MT_object_context_menu, bpy.types.OUTLINER_MT_object)
-]
+CONTEXT_MENUS = bpy.types.VIEW3D_MT_object_context_menu, bpy.types.OUTLINER_MT_object
+MENUS += [(menu, menus.draw_in_context_menu) for menu in CONTEXT_MENUS]
 
-_UNDONE = (recoloring.check, runs.after_update, live_scanner.after_undo, slices.after_undo, framing.after_undo)
-_UPDATED = (
+_AFTER_UNDO = (recoloring.check, runs.after_update, live_scanner.after_undo, slices.after_undo, framing.after_undo)
+_AFTER_UPDATE = (
     live_scanner.after_update, selection.after_update, planes.after_update, frustums.after_update, slices.after_update,
 )  # fmt: skip
-_LOADED = (
-    storage.after_load,
-    volumes.after_load,
-    recovery.after_load,
-    live_scanner.after_load,
-    runs.after_load,
-    recoloring.check,
-)
-_FRAME = (runs.after_update, live_scanner.after_frame, preview.after_update, slices.after_frame_change)
-# By lists of bpy.app.handlers; all of them stay when a file is loaded.
+_AFTER_LOAD = (
+    storage.after_load, volumes.after_load, recovery.after_load, live_scanner.after_load, runs.after_load, recoloring.check,
+)  # fmt: skip
+_AFTER_FRAME = (runs.after_update, live_scanner.after_frame, preview.after_update, slices.after_frame_change)
+# Functions by list of `bpy.app.handlers`; all of them stay when a file is loaded.
 _HANDLERS: dict[str, tuple[Any, ...]] = {
     "load_pre": (jobs.stop, slices.before_load, preview.stop, framing.forget),
-    "load_post": _LOADED,
-    "depsgraph_update_post": (*_UPDATED, runs.after_update, preview.after_update),
-    "frame_change_post": _FRAME,
+    "load_post": _AFTER_LOAD,
+    "depsgraph_update_post": (*_AFTER_UPDATE, runs.after_update, preview.after_update),
+    "frame_change_post": _AFTER_FRAME,
     "undo_pre": (framing.before_undo,),
     "redo_pre": (framing.before_undo,),
-    "undo_post": (*_UNDONE, preview.after_update),
-    "redo_post": (*_UNDONE, preview.after_update),
+    "undo_post": (*_AFTER_UNDO, preview.after_update),
+    "redo_post": (*_AFTER_UNDO, preview.after_update),
     "render_init": (figures.before_render,),
     "save_pre": (storage.before_save, slices.before_save),
     "save_post": (storage.after_save,),
     "save_post_fail": (storage.restore_paths,),
 }
 HANDLERS = tuple(
-    (getattr(bpy.app.handlers, name), bpy.app.handlers.persistent(each))
-    for name, group in _HANDLERS.items()
-    for each in group
+    (getattr(bpy.app.handlers, name), bpy.app.handlers.persistent(function))
+    for name, functions in _HANDLERS.items()
+    for function in functions
 )
 
-# What is drawn over Blender's editors, in a window.
+# Functions that draw over Blender's editors, where there is a window.
 DRAWINGS = (
     (bpy.types.SpaceImageEditor, tiles.draw, "POST_PIXEL"),
     (bpy.types.SpaceImageEditor, epipolar_drawing.draw_over_pictures, "POST_PIXEL"),
@@ -148,15 +147,15 @@ DRAWINGS = (
 
 
 def _modules_removed(scene: bpy.types.Scene, modules: list[bpy.types.Object]) -> None:
-    """Remove what a scene shows of modules: their projections, and the volumes as they see them."""
+    """Remove projections of modules from a scene, and volumes in the modules' coordinates."""
     planes.remove(scene, modules)
     frustums.remove(scene, modules)
 
 
-# What edited properties and rooms below call (`addon/blender/updates.py`).
+# Functions that edited properties and lower rooms call (`addon/blender/updates.py`).
 UPDATES: dict[str, Callable[..., None]] = {
     "module": following.refresh_module,
-    "length": following.length_typed,
+    "length": following.keep_typed_length,
     "visible": scanner.set_visible,
     "scanner": following.refresh,
     "all_modules": following.set_for_all,
@@ -174,11 +173,11 @@ UPDATES: dict[str, Callable[..., None]] = {
     "modules_removed": _modules_removed,
 }
 
-_registered = ExitStack()  # takes back what was registered, in reverse order
+_registered = ExitStack()  # undoes the registration, in reverse order
 
 
 def register(command: Callable[..., int] | None = None) -> None:
-    """Register everything, or nothing if something fails; `command` is what ``blender --command mphdrr`` calls."""
+    """Register everything, or nothing if something fails; `command` is the function of ``blender --command mphdrr``."""
     updates.FUNCTIONS.update(UPDATES)
     properties.add_columns()
     try:
@@ -197,11 +196,11 @@ def register(command: Callable[..., int] | None = None) -> None:
             handlers.append(function)
             _registered.callback(_remove_handler, handlers, function)
         if not bpy.app.background:
-            for space, draw, when in DRAWINGS:
-                drawing = space.draw_handler_add(draw, (), "WINDOW", when)
+            for space, draw, draw_type in DRAWINGS:
+                drawing = space.draw_handler_add(draw, (), "WINDOW", draw_type)
                 _registered.callback(space.draw_handler_remove, drawing, "WINDOW")
             keymaps = bpy.context.window_manager.keyconfigs.addon.keymaps
-            for name in ("Image", "Image Editor Tool: Sample"):  # the editor's usual tool takes clicks first
+            for name in ("Image", "Image Editor Tool: Sample"):  # the latter takes clicks before "Image" does
                 keymap = keymaps.new(name, space_type="IMAGE_EDITOR")
                 click = keymap.keymap_items.new("mphdrr.pick_module", "LEFTMOUSE", "PRESS")
                 _registered.callback(keymap.keymap_items.remove, click)
@@ -215,12 +214,12 @@ def register(command: Callable[..., int] | None = None) -> None:
         _registered.close()
         raise
     if bpy.app.module:
-        # Registered classes keep Python's bpy module alive: Blender 4.5 would wait for ever when Python ends.
+        # Registered classes keep Python's bpy module alive: Blender 4.5 would never finish when Python ends.
         atexit.register(unregister)
 
 
 def _complete(cls: Any) -> None:
-    """Give a class what follows from its name and its docstring, where it does not say another."""
+    """Give a class the label, idname and tooltip that follow from its name and docstring, unless it has its own."""
     if cls.__name__.startswith("MPHDRR_"):
         cls.bl_label = getattr(cls, "bl_label", ids.label(cls.__name__))
     if issubclass(cls, bpy.types.Operator):
@@ -230,7 +229,7 @@ def _complete(cls: Any) -> None:
 
 
 def unregister() -> None:
-    """Take back what `register` did."""
+    """Undo `register`."""
     atexit.unregister(unregister)
     for module in (jobs, preview, plots, recoloring, event_notes, timers):
         module.stop()
@@ -238,5 +237,6 @@ def unregister() -> None:
 
 
 def _remove_handler(handlers: list[Any], function: Any) -> None:
+    """Remove a handler that may already be gone."""
     if function in handlers:  # loading a file drops handlers that are not persistent
         handlers.remove(function)

@@ -83,7 +83,7 @@ def main() -> None:
         parser.add_argument(f"--{name}", type=int, default=default)
     chosen = parser.parse_args()
     os.environ["ITK_GLOBAL_DEFAULT_NUMBER_OF_THREADS"] = str(chosen.threads)
-    from mphdrr.core.projector.parallel import set_usual_threads
+    from mphdrr.core.rays.parallel import set_usual_threads
 
     set_usual_threads(chosen.threads)
     pitch, size = 400.0 / chosen.voxels, 180.0 / chosen.voxels

@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 
 import mphdrr.core as mph
-from mphdrr.core.projector import backends
+from mphdrr.core.rays import backends
 
 WORKBOOK = Path(__file__).parents[1] / "examples" / "dc-spect-80.xlsx"
 SIDE = 256.0  # mm, of the cube of voxels

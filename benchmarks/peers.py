@@ -29,7 +29,7 @@ import numpy as np
 from case import Case
 
 import mphdrr.core as mph
-from mphdrr.core.projector import backends
+from mphdrr.core.rays import backends
 
 Call = Callable[[], np.ndarray]
 TASKS = ("forward", "adjoint", "emission", "pose_gradient")
@@ -97,7 +97,7 @@ class Ours(Peer):
         return lambda: A(x)
 
     def pose_gradient(self, case: Case) -> Call:
-        from mphdrr.core.projector.poses import pinhole_images
+        from mphdrr.core.projector.torch_cameras import pinhole_images
 
         volume = mph.Volume(case.volume("smooth"), case.grid)
 
@@ -357,7 +357,7 @@ class TorchPeer(Peer):
         return call
 
     def pose_gradient(self, case: Case) -> Call:
-        from mphdrr.core.projector.poses import pinhole_rays
+        from mphdrr.core.projector.torch_cameras import pinhole_rays
 
         torch = self._torch
         render = self.renderer(case, torch.from_numpy(case.volume("smooth")))

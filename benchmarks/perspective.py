@@ -45,7 +45,7 @@ def main() -> None:
     parser.add_argument("--voxels", type=int, nargs=3, default=(128, 128, 64))
     chosen = parser.parse_args()
     import mphdrr.core as mph
-    from mphdrr.core.projector.parallel import set_usual_threads
+    from mphdrr.core.rays.parallel import set_usual_threads
 
     set_usual_threads(chosen.threads)
     views = mph.read_system(WORKBOOK).views((chosen.pixels, chosen.pixels))

@@ -1,11 +1,13 @@
-"""Lazy packages: a public name is imported when it is used for the first time."""
+"""Lazy packages, whose public names are imported when they are used for the first time; and old paths of modules."""
 
 import ast
 import contextlib
 import sys
+import warnings
 from collections.abc import Callable
 from importlib import import_module
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 from .errors import needing
@@ -32,3 +34,35 @@ def public(package: str, extra: str = "") -> tuple[Callable[[str], Any], Callabl
         return attribute
 
     return import_attribute, lambda: sorted({*vars(module), *modules}), [n for n, source in modules.items() if source]
+
+
+def deprecated_modules(package: str, new_paths: dict[str, str]) -> None:
+    """Keep old module paths importable; each name that is taken from one gives a `DeprecationWarning` with the new path.
+
+    Parameters
+    ----------
+    package
+        The package in which the old modules were.
+    new_paths
+        Path in `core` by the old path in `package`; a package stands before its modules.
+    """
+    for old, new in new_paths.items():
+        alias = sys.modules[f"{package}.{old}"] = _DeprecatedModule(f"{package}.{old}")
+        alias._new_path = f"{__package__}.{new}"
+        parent, _, name = alias.__name__.rpartition(".")
+        vars(sys.modules[parent]).setdefault("__path__", [])  # ``import parent.name`` asks whether it is a package
+        setattr(sys.modules[parent], name, alias)
+
+
+class _DeprecatedModule(ModuleType):
+    """An old path of a module; `_new_path` is its present one."""
+
+    _new_path: str
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("__"):
+            raise AttributeError(f"module {self.__name__!r} has no attribute {name!r}")
+        text = f"{self.__name__} is deprecated: import {name} from {self._new_path}"
+        warnings.warn(text, DeprecationWarning, stacklevel=2)
+        module = import_module(self._new_path)
+        return getattr(module, name) if hasattr(module, name) else import_module(f"{self._new_path}.{name}")

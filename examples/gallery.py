@@ -186,7 +186,7 @@ def in_the_scanner(system: mph.PinholeSystem, folder: Path, ct: mph.Volume | Non
     volumes.add_volume(PHANTOMS["Derenzo"].voxelize(mph.Grid.centered(256, 0.4), pose), "Derenzo phantom")
     picture("picture", "picture", (1200, 750))
     bpy.data.objects.remove(*volumes.volume_objects(scene))
-    jobs.run(maps.mapping(scene, "sensitivity", voxels=128))
+    jobs.run(maps.map_job(scene, "sensitivity", voxels=128))
     slices.remove_slices(*volumes.volume_objects(scene))  # it is cut open in front of them
     picture("sensitivity")
     if ct is not None:

@@ -15,9 +15,9 @@ import numpy as np
 import torch
 
 import mphdrr.core as mph
+from mphdrr.core.exchange.diffdrr.pose_search import pose_error, register_pose
 from mphdrr.core.geometry.rotations import pose_matrix, se3_exp
-from mphdrr.core.projector.pose_search import pose_error, register_pose
-from mphdrr.core.projector.poses import pinhole_images
+from mphdrr.core.projector.torch_cameras import pinhole_images
 
 WATER = 0.02  # 1/mm, at about 70 keV
 DISTANCE = 1000.0  # mm, source to detector

@@ -7,7 +7,7 @@ from bpy.props import BoolProperty, FloatProperty, FloatVectorProperty, StringPr
 
 from ..addon.blender import file_properties, jobs, layouts, storage
 from ..addon.phantoms import phantoms
-from ..addon.phantoms.phantom_properties import FILE, FITTED, PhantomSettings, identifier, sampling, settings_class
+from ..addon.phantoms.phantom_properties import AUTO_SIZE, FILE, PhantomSettings, identifier, sampling, settings_class
 from ..addon.runs import projection_properties
 from ..addon.scanner import scanner
 from ..core import Phantom, euler_pose, read_phantom
@@ -46,7 +46,7 @@ class AddPhantom(jobs.JobOperator):
 
     def adding(self: Any, name: str) -> jobs.Job:
         pose = euler_pose(self.phi, self.theta, self.psi, self.location)
-        return phantoms.adding(self, name, pose, self.attenuation)
+        return phantoms.add_phantom_job(self, name, pose, self.attenuation)
 
 
 class AddKind(AddPhantom):
@@ -80,13 +80,13 @@ class MPHDRR_OT_import_phantom(PhantomSettings, AddPhantom, bpy.types.Operator):
         "filter_glob": file_properties.shown_files((".toml",)),
         "name": StringProperty(name="Name", description="Object's name; empty: phantom's", options={"SKIP_SAVE"}),
         **sampling(),
-        **FITTED,
+        **AUTO_SIZE,
     }
     identifier = FILE
     asks_for = "filepath"
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
-        path = self.given_file("set filepath to a phantom's TOML file")
+        path = self.required_file("set filepath to a phantom's TOML file")
         return self.adding(self.name or read_phantom(path).name or path.stem)
 
     def phantom(self) -> Phantom:

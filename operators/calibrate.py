@@ -27,5 +27,5 @@ class MPHDRR_OT_calibrate(jobs.JobOperator, bpy.types.Operator):
     )  # fmt: skip
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
-        path = self.given_file("set filepath to a calibration recipe (.toml)")
-        return calibrating.calibrating(context, path, self.apply, self.exaggeration)
+        path = self.required_file("set filepath to a calibration recipe (.toml)")
+        return calibrating.calibrate_job(context, path, self.apply, self.exaggeration)

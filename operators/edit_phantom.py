@@ -14,7 +14,7 @@ class _EditPhantom(jobs.JobOperator):
     poll = reports.needs(phantoms.ACTIVE)
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
-        return phantoms.updating(context.object, self.bake)
+        return phantoms.update_phantom_job(context.object, self.bake)
 
 
 class MPHDRR_OT_update_phantom(_EditPhantom, bpy.types.Operator):

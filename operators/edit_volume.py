@@ -59,7 +59,7 @@ class MPHDRR_OT_ct_to_attenuation(jobs.JobOperator, bpy.types.Operator):
     poll = needs((_is_ct, "No CT is active: select a volume of CT numbers (hu)"))
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
-        return volume_import.converting(context.object, decimals.typed(self.energy))
+        return volume_import.attenuation_job(context.object, decimals.typed(self.energy))
 
 
 class MPHDRR_OT_add_dose_map(jobs.JobOperator, bpy.types.Operator):
@@ -75,7 +75,7 @@ class MPHDRR_OT_add_dose_map(jobs.JobOperator, bpy.types.Operator):
     poll = needs((_is_activity, "No activity is active: select a volume of activity"))
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
-        return volume_import.dosing(context.object, self.isotope)
+        return volume_import.dose_job(context.object, self.isotope)
 
 
 class MPHDRR_OT_clean_volume_files(Reported, bpy.types.Operator):
@@ -89,7 +89,7 @@ class MPHDRR_OT_clean_volume_files(Reported, bpy.types.Operator):
         if not unused:
             return self.execute(context)
         message = "Neither Undo nor other .blend files that use this folder will find them again."
-        return ask_to_remove(self, context, event, f"Remove {storage.summary(unused)}?", message)
+        return ask_to_remove(self, context, event, f"Remove {storage.summarize_unused(unused)}?", message)
 
     def act(self, context: bpy.types.Context) -> str:
         return storage.remove_unused()
@@ -103,7 +103,7 @@ class MPHDRR_OT_collect_files(Reported, bpy.types.Operator):
     poll = needs((lambda context: bpy.data.filepath, "Save the .blend first: its folder is beside it"))
 
     def act(self, context: bpy.types.Context) -> str:
-        return storage.collect()
+        return storage.collect_files()
 
 
 class MPHDRR_OT_add_looks(Reported, bpy.types.Operator):
@@ -135,10 +135,12 @@ class MPHDRR_OT_remake_volumes(jobs.JobOperator, bpy.types.Operator):
 
     bl_label = "Make Missing Volumes Again"
 
-    poll = needs((lambda context: recovery.missing(context.scene)[0], "No phantom or map misses its file of voxels"))
+    poll = needs(
+        (lambda context: recovery.missing_volumes(context.scene)[0], "No phantom or map misses its file of voxels")
+    )
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
-        return recovery.remaking(context.scene)
+        return recovery.remake_job(context.scene)
 
 
 class MPHDRR_OT_find_volume_files(Reported, bpy.types.Operator):

@@ -37,7 +37,9 @@ class MPHDRR_OT_try_event(jobs.JobOperator, bpy.types.Operator):
     folder: event_properties.FOLDER
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
-        return event_sets.trying(context, *self.given(context.scene.mphdrr_events, "recipe", "number", "folder"))
+        return event_sets.try_event_job(
+            context, *self.setting_values(context.scene.mphdrr_events, "recipe", "number", "folder")
+        )
 
 
 class MPHDRR_OT_make_event_set(jobs.JobOperator, bpy.types.Operator):
@@ -50,7 +52,7 @@ class MPHDRR_OT_make_event_set(jobs.JobOperator, bpy.types.Operator):
     count: event_properties.COUNT
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
-        return event_sets.making(*self.given(context.scene.mphdrr_events, "recipe", "folder", "count"))
+        return event_sets.make_set_job(*self.setting_values(context.scene.mphdrr_events, "recipe", "folder", "count"))
 
 
 class MPHDRR_OT_open_event(jobs.JobOperator, bpy.types.Operator):
@@ -63,4 +65,6 @@ class MPHDRR_OT_open_event(jobs.JobOperator, bpy.types.Operator):
     model: event_properties.MODEL
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
-        return event_sets.opening(context, *self.given(context.scene.mphdrr_events, "folder", "opened", "model"))
+        return event_sets.open_event_job(
+            context, *self.setting_values(context.scene.mphdrr_events, "folder", "opened", "model")
+        )

@@ -39,8 +39,8 @@ class MPHDRR_OT_export_geometry(jobs.ExportJob, bpy.types.Operator):
         return super().ask(context)
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
-        path = self.given_file("set filepath to a name ending in .xlsx")
-        return scanner_files.exporting_scanner(scanner.required_scanner(context.scene), path, self.use_template)
+        path = self.required_file("set filepath to a name ending in .xlsx")
+        return scanner_files.export_workbook_job(scanner.required_scanner(context.scene), path, self.use_template)
 
 
 class MPHDRR_OT_export_for_program(jobs.ExportJob, bpy.types.Operator):
@@ -67,10 +67,10 @@ class MPHDRR_OT_export_for_program(jobs.ExportJob, bpy.types.Operator):
         return old_path != self.filepath
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
-        path, images = self.given_file("set filepath"), context.scene.mphdrr_projections
+        path, images = self.required_file("set filepath"), context.scene.mphdrr_projections
         shape, magnification = (images.height, images.width), decimals.typed(images.magnification)
         collection, detector = scanner.required_scanner(context.scene), images.detector.lower()
-        return scanner_files.exporting_for_program(collection, path, self.format, shape, detector, magnification)
+        return scanner_files.export_program_job(collection, path, self.format, shape, detector, magnification)
 
     def draw(self, context: bpy.types.Context) -> None:
         self.layout.prop(self, "format")

@@ -3,7 +3,7 @@
 import bpy
 
 from ..addon.blender import file_properties, jobs, reports
-from ..addon.phantoms.volume_export import WRITTEN_ENDINGS, exporting
+from ..addon.phantoms.volume_export import WRITTEN_ENDINGS, export_job
 from ..addon.volumes import volumes
 
 
@@ -24,5 +24,5 @@ class MPHDRR_OT_export_volume(jobs.ExportJob, bpy.types.Operator):
         return super().ask(context)
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
-        path = self.given_file(f"expected a name ending in {', '.join(WRITTEN_ENDINGS)}")
-        return exporting(context.object, path)
+        path = self.required_file(f"expected a name ending in {', '.join(WRITTEN_ENDINGS)}")
+        return export_job(context.object, path)

@@ -51,7 +51,7 @@ class FigureOperator(jobs.ExportJob):
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
         operator: Any = self  # the type checker does not know Blender's properties
-        path = self.given_file(f"set filepath to a name ending in {' or '.join(self.endings)}")
+        path = self.required_file(f"set filepath to a name ending in {' or '.join(self.endings)}")
         if bool(operator.width) != bool(operator.height):
             raise InputError("size: give both width and height, or neither")
         size = (operator.width, operator.height) if operator.width else None

@@ -7,7 +7,7 @@ from bpy.props import FloatProperty, StringProperty
 
 from ..addon.blender import decimals, jobs, layouts, storage
 from ..addon.blender.file_properties import DIRECTORY, file_property, files_property, shown_files
-from ..addon.blender.setting_properties import properties_of, values_of
+from ..addon.blender.setting_properties import make_properties, read_values
 from ..addon.runs import counts_import
 from ..core.runs.frame_files import COUNTS_FORMATS
 from ..core.runs.settings import SETTINGS
@@ -62,11 +62,11 @@ class MPHDRR_OT_import_counts(jobs.JobOperator, bpy.types.Operator):
         names = sorted({item.name for item in self.files if item.name})
         folder = storage.absolute(self.directory)
         paths = [folder / name for name in names] if len(names) > 1 else [storage.absolute(self.filepath)]
-        return counts_import.importing(context, paths if self.filepath or names else [], self._entries())
+        return counts_import.import_counts_job(context, paths if self.filepath or names else [], self._entries())
 
     def _entries(self) -> dict[str, Any]:
         """Return the settings as entries of a recipe, by key; None for those that are not set."""
-        settings = values_of(_PROPERTIES, lambda name: getattr(self, name))
+        settings = read_values(_PROPERTIES, lambda name: getattr(self, name))
         return {
             **{key: value or None for key, value in settings.items()},
             "model.time": decimals.typed(self.time) or None,
@@ -75,4 +75,4 @@ class MPHDRR_OT_import_counts(jobs.JobOperator, bpy.types.Operator):
         }
 
 
-MPHDRR_OT_import_counts.__annotations__.update(properties_of(_PROPERTIES))
+MPHDRR_OT_import_counts.__annotations__.update(make_properties(_PROPERTIES))

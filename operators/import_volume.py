@@ -10,7 +10,7 @@ import bpy
 from bpy.props import BoolProperty, EnumProperty, FloatProperty, IntProperty, StringProperty
 
 from ..addon.blender import choices, decimals, file_properties, jobs, layouts, storage
-from ..addon.volumes.volume_import import READ_ENDINGS, importing, name_of
+from ..addon.volumes.volume_import import READ_ENDINGS, import_job, name_without_ending
 from ..core.errors import InputError
 from ..core.volumes.volume import UNITS
 
@@ -64,8 +64,8 @@ class ReadVolumes(jobs.JobOperator):
         row.prop(self, "energy")
         layouts.draw_all(layout.column(heading="OpenVDB", align=True), self, "grid", "unit")
 
-    def importing(self, paths: Sequence[Path], name: str, frame_start: int = 1) -> jobs.Job:
-        return importing(
+    def import_job(self, paths: Sequence[Path], name: str, frame_start: int = 1) -> jobs.Job:
+        return import_job(
             paths,
             name,
             quantity=None if self.quantity == "AUTO" else self.quantity,
@@ -87,8 +87,8 @@ class MPHDRR_OT_import_volume(ReadVolumes, bpy.types.Operator):
     name: StringProperty(name="Name", description="The object's name. Empty: the file's", options={"SKIP_SAVE"})
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
-        path = self.given_file("set filepath to a volume's file, or to the folder of a DICOM series")
-        return self.importing([path], self.name)
+        path = self.required_file("set filepath to a volume's file, or to the folder of a DICOM series")
+        return self.import_job([path], self.name)
 
 
 class MPHDRR_OT_import_volume_sequence(ReadVolumes, bpy.types.Operator):
@@ -116,5 +116,5 @@ class MPHDRR_OT_import_volume_sequence(ReadVolumes, bpy.types.Operator):
             if not path.name.lower().endswith(_SEQUENCE_ENDINGS):
                 endings = ", ".join(_SEQUENCE_ENDINGS)
                 raise InputError(f"{path}: expected a name ending in {endings}; a DICOM series is one volume")
-        common = re.sub(r"[\d _.-]*$", "", os.path.commonprefix([name_of(path) for path in paths]))  # noqa: RUF071
-        return self.importing(paths, self.name or common, self.frame_start)
+        common = re.sub(r"[\d _.-]*$", "", os.path.commonprefix([name_without_ending(path) for path in paths]))  # noqa: RUF071
+        return self.import_job(paths, self.name or common, self.frame_start)

@@ -87,7 +87,7 @@ class MPHDRR_OT_duplicate_modules(selection.OnModules, bpy.types.Operator):
 
     def change(self, context: bpy.types.Context, collection: bpy.types.Collection) -> str:
         modules = selection.selected_modules(context)
-        copies = module_edits.duplicate(collection, modules, self.count, self.angle, self.follow_ring)
+        copies = module_edits.duplicate_modules(collection, modules, self.count, self.angle, self.follow_ring)
         selection.select(context, copies)
         return f"Made {modules_text([camera.mphdrr_module.number for camera in copies])}"
 
@@ -98,7 +98,7 @@ class MPHDRR_OT_remove_modules(selection.OnModules, bpy.types.Operator):
     def change(self, context: bpy.types.Context, collection: bpy.types.Collection) -> str:
         modules = selection.selected_modules(context)
         text = modules_text([camera.mphdrr_module.number for camera in modules])
-        module_edits.remove(collection, modules)
+        module_edits.remove_modules(collection, modules)
         return f"Removed {text}"
 
 
@@ -195,4 +195,4 @@ class MPHDRR_OT_add_map(jobs.JobOperator, bpy.types.Operator):
     within_roi: BoolProperty(name="Within ROI", description="Set voxels outside the ROI sphere to 0", default=True)
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
-        return maps.mapping(context.scene, self.quantity, self.voxels, decimals.typed(self.side), self.within_roi)
+        return maps.map_job(context.scene, self.quantity, self.voxels, decimals.typed(self.side), self.within_roi)

@@ -18,4 +18,4 @@ class MPHDRR_OT_optimise(jobs.JobOperator, bpy.types.Operator):
     filter_glob: file_properties.shown_files([".toml"])
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
-        return optimising.optimizing(context.scene, self.given_file("set filepath to a design recipe (.toml)"))
+        return optimising.optimize_job(context.scene, self.required_file("set filepath to a design recipe (.toml)"))

@@ -21,7 +21,9 @@ class MPHDRR_OT_show_in_perspective(_PerspectiveOperator, bpy.types.Operator):
     """
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
-        return frustums.showing(context, *self.given(context.scene.mphdrr_perspective, "planes", "uniform"))
+        return frustums.frustum_job(
+            context, *self.setting_values(context.scene.mphdrr_perspective, "planes", "uniform")
+        )
 
 
 class MPHDRR_OT_resample_in_perspective(_PerspectiveOperator, bpy.types.Operator):
@@ -32,7 +34,9 @@ class MPHDRR_OT_resample_in_perspective(_PerspectiveOperator, bpy.types.Operator
     bl_label = "Volume Through Module"
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
-        return frustums.resampling(context, *self.given(context.scene.mphdrr_perspective, "cells", "uniform"))
+        return frustums.resample_job(
+            context, *self.setting_values(context.scene.mphdrr_perspective, "cells", "uniform")
+        )
 
 
 class MPHDRR_OT_clear_perspective(reports.Reported, bpy.types.Operator):

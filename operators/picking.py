@@ -28,7 +28,7 @@ class MPHDRR_OT_pick_pixel(eyedropper.Eyedropper, reports.Reported, bpy.types.Op
         options={"SKIP_SAVE"},
     )  # fmt: skip
 
-    asks = "a pixel of a projection"
+    target_words = "a pixel of a projection"
     poll = reports.needs(images.PROJECTED)
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
@@ -41,11 +41,11 @@ class MPHDRR_OT_pick_pixel(eyedropper.Eyedropper, reports.Reported, bpy.types.Op
 
     def act(self, context: bpy.types.Context) -> str:
         coordinates = (decimals.typed(number) for number in (self.column, self.row, self.k))
-        picked = epipolar.pick(context.scene, self.module, *coordinates)
+        picked = epipolar.pick_pixel(context.scene, self.module, *coordinates)
         column, row = picked.pixel
         return f"Module {self.module}, column {column:g}, row {row:g}: {picked.seen_by} modules see the marker"
 
-    def under(self, context: bpy.types.Context, event: bpy.types.Event) -> tuple[int, int, int] | None:
+    def target_under(self, context: bpy.types.Context, event: bpy.types.Event) -> tuple[int, int, int] | None:
         """Return the module's number, the column and the row of the pixel under the mouse, or None."""
         mouse, run = eyedropper.region_under(context, event), epipolar.run_views(context.scene)
         if mouse is None or run is None:
@@ -53,7 +53,7 @@ class MPHDRR_OT_pick_pixel(eyedropper.Eyedropper, reports.Reported, bpy.types.Op
         area, region, place = mouse
         if area.type == "IMAGE_EDITOR":
             hit = tiles.picture_at(area.spaces.active.image, *region.view2d.region_to_view(*place))
-            return None if hit is None else (hit[0].number, *hit[0].pixel(hit[1], run.views.shape))
+            return None if hit is None else (hit[0].number, *hit[0].pixel_at(hit[1], run.views.shape))
         if area.type != "VIEW_3D":
             return None
         origin, direction = (
@@ -62,13 +62,13 @@ class MPHDRR_OT_pick_pixel(eyedropper.Eyedropper, reports.Reported, bpy.types.Op
         )
         return epipolar_drawing.plane_pixel(context, run, origin, direction)
 
-    def says(self, pixel: tuple[int, int, int] | None) -> str:
+    def status_text(self, pixel: tuple[int, int, int] | None) -> str:
         """Return the status bar's text for the pixel under the mouse, if any."""
         if pixel is None:
-            return f"Click on {self.asks}, in the Image Editor or on a plane   (Esc: cancel)"
+            return f"Click on {self.target_words}, in the Image Editor or on a plane   (Esc: cancel)"
         return "Module {}, column {}, row {}   (click: pick; Esc: cancel)".format(*pixel)
 
-    def takes(self, context: bpy.types.Context, pixel: tuple[int, int, int]) -> bool:
+    def pick(self, context: bpy.types.Context, pixel: tuple[int, int, int]) -> bool:
         """Pick the clicked pixel; return whether that succeeded."""
         self.module, self.column, self.row = pixel
         with suppress(InputError):  # the pixel can be picked even if its module is hidden or not in the scene any more
@@ -106,13 +106,13 @@ class MPHDRR_OT_pick_window(eyedropper.Eyedropper, bpy.types.Operator):
         default="HIGH", options={"SKIP_SAVE"},
     )  # fmt: skip
 
-    asks = "a picture of the projections"
+    target_words = "a picture of the projections"
     poll = reports.needs(
         (lambda context: images.tiles(bpy.data.images.get(ids.MOSAIC)), images.PROJECTED[1]),
         (_has_image_editor, "No Image Editor is open: press Show Mosaic"),
     )
 
-    def under(self, context: bpy.types.Context, event: bpy.types.Event) -> tuple[str, float] | None:
+    def target_under(self, context: bpy.types.Context, event: bpy.types.Event) -> tuple[str, float] | None:
         """Return the description and the exact value of the number under the mouse, or None."""
         mouse = eyedropper.region_under(context, event)
         if mouse is None or mouse[0].type != "IMAGE_EDITOR":
@@ -120,7 +120,7 @@ class MPHDRR_OT_pick_window(eyedropper.Eyedropper, bpy.types.Operator):
         area, region, place = mouse
         return tiles.value_at(area.spaces.active.image, *region.view2d.region_to_view(*place))
 
-    def takes(self, context: bpy.types.Context, number: tuple[str, float]) -> bool:
+    def pick(self, context: bpy.types.Context, number: tuple[str, float]) -> bool:
         """Make the clicked number an end of the window; return whether that succeeded."""
         mosaic = images.tiles(bpy.data.images[ids.MOSAIC]) or {}
         settings = context.scene.mphdrr_display
@@ -133,10 +133,10 @@ class MPHDRR_OT_pick_window(eyedropper.Eyedropper, bpy.types.Operator):
         self.report({"INFO"}, f"Window {self.end.lower()} is {number[1]:g} {mosaic['unit']}: {number[0]}")
         return True
 
-    def says(self, number: tuple[str, float] | None) -> str:
+    def status_text(self, number: tuple[str, float] | None) -> str:
         """Return the status bar's text for the number under the mouse, if any."""
         unit = (images.tiles(bpy.data.images.get(ids.MOSAIC)) or {}).get("unit", "")
-        text = f"{number[0]}: {number[1]:g} {unit}" if number else f"Click on {self.asks}"
+        text = f"{number[0]}: {number[1]:g} {unit}" if number else f"Click on {self.target_words}"
         return f"{text}   (click: window {self.end.lower()}; Esc: cancel)"
 
 
@@ -155,7 +155,7 @@ class MPHDRR_OT_pick_module(bpy.types.Operator):
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
         try:
-            picked = tiles.pick(context, event.mouse_region_x, event.mouse_region_y)
+            picked = tiles.pick_module(context, event.mouse_region_x, event.mouse_region_y)
         except InputError as error:
             self.report({"WARNING"}, reports.in_window(error))
             return {"CANCELLED"}

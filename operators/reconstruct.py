@@ -10,7 +10,7 @@ from .render_projections import ShowPicture
 
 _DONE: Need = (lambda _: ids.RECONSTRUCTION in bpy.data.images, "No reconstruction yet: reconstruct a run first")
 _NOTHING = "Nothing to continue: the method has no iterations, or the file of the last one is not beside its voxels"
-_RUN: Need = (lambda context: runs.shown(context.scene) is not None, "No run yet: render the projections first")
+_RUN: Need = (lambda context: runs.shown_run(context.scene) is not None, "No run yet: render the projections first")
 
 
 class MPHDRR_OT_reconstruct(reconstruction_properties.ReconstructionSettings, jobs.JobOperator, bpy.types.Operator):
@@ -30,10 +30,10 @@ class MPHDRR_OT_reconstruct(reconstruction_properties.ReconstructionSettings, jo
         return super().ask(context)
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
-        return reconstructions.reconstructing(
+        return reconstructions.reconstruct_job(
             context,
             reconstruction_properties.settings_recipe(
-                self.given_or(context.scene.mphdrr_reconstruction), self.properties.is_property_set
+                self.setting_getter(context.scene.mphdrr_reconstruction), self.properties.is_property_set
             ),
         )
 
@@ -41,10 +41,10 @@ class MPHDRR_OT_reconstruct(reconstruction_properties.ReconstructionSettings, jo
 class MPHDRR_OT_continue_reconstruction(jobs.JobOperator, bpy.types.Operator):
     """Do ten more iterations of the last reconstruction, of the same run with the same settings, in the same volume"""
 
-    poll = needs(_DONE, (reconstructions.resumable, _NOTHING))
+    poll = needs(_DONE, (reconstructions.resume_path, _NOTHING))
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
-        return reconstructions.continuing(context)
+        return reconstructions.continue_job(context)
 
 
 class MPHDRR_OT_backproject(reconstruction_properties.BackprojectionSettings, jobs.JobOperator, bpy.types.Operator):
@@ -58,8 +58,10 @@ class MPHDRR_OT_backproject(reconstruction_properties.BackprojectionSettings, jo
     poll = needs(_RUN)
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
-        get = self.given_or(context.scene.mphdrr_reconstruction)
-        return backprojections.backprojecting(context, reconstruction_properties.voxels_recipe(get), get("how").lower())
+        get = self.setting_getter(context.scene.mphdrr_reconstruction)
+        return backprojections.backproject_job(
+            context, reconstruction_properties.voxels_recipe(get), get("how").lower()
+        )
 
 
 class MPHDRR_OT_show_reconstruction(ShowPicture, bpy.types.Operator):

@@ -51,7 +51,7 @@ class MPHDRR_OT_render_projections(projection_properties.ProjectionSettings, job
         coefficient = name.replace("_material", "_mu")
         if not self.properties.is_property_set(name) and self.properties.is_property_set(coefficient):
             return "NUMBER"
-        return self.given_or(scene.mphdrr_projections)(name)
+        return self.setting_getter(scene.mphdrr_projections)(name)
 
 
 class MPHDRR_OT_use_preset(reports.Reported, bpy.types.Operator):
@@ -117,4 +117,6 @@ class MPHDRR_OT_export_dataset(jobs.ExportJob, bpy.types.Operator):
             self.layout.label(text=line, icon="ERROR")
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
-        return rendering.exporting(context.scene, self.given_file("set filepath to a name ending in .h5, .npz or .pt"))
+        return rendering.export_job(
+            context.scene, self.required_file("set filepath to a name ending in .h5, .npz or .pt")
+        )

@@ -38,7 +38,7 @@ class MPHDRR_OT_show_run(jobs.JobOperator, bpy.types.Operator):
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
         _required_run(context.scene, self.index)
-        return rendering.showing_job(context.scene, self.index)
+        return rendering.show_run_job(context.scene, self.index)
 
 
 class MPHDRR_OT_remove_run(Reported, bpy.types.Operator):
@@ -51,7 +51,7 @@ class MPHDRR_OT_remove_run(Reported, bpy.types.Operator):
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
         item = _required_run(context.scene, self.index)
         message = "Neither Undo nor the .blend as it was saved will find its file again."
-        return ask_to_remove(self, context, event, f"Remove {item.name!r} ({runs.size_text([item])})?", message)
+        return ask_to_remove(self, context, event, f"Remove {item.name!r} ({runs.file_size_text([item])})?", message)
 
     def act(self, context: bpy.types.Context) -> str:
         _required_run(context.scene, self.index)
@@ -61,7 +61,7 @@ class MPHDRR_OT_remove_run(Reported, bpy.types.Operator):
 def _other_runs(self: Any, context: bpy.types.Context | None) -> list[tuple[str, str, str]]:
     """Return the choices of runs that are not shown, by their indices in the list."""
     scene_runs = context.scene.mphdrr_projections.runs if context is not None else ()
-    shown_run = runs.shown(context.scene) if context is not None else None
+    shown_run = runs.shown_run(context.scene) if context is not None else None
     _choices[:] = [(str(i), item.name, item.summary) for i, item in enumerate(scene_runs) if item != shown_run]
     return _choices
 
@@ -84,12 +84,12 @@ class MPHDRR_OT_flood_efficiency(jobs.ExportJob, bpy.types.Operator):
     )  # fmt: skip
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
-        flood = storage.absolute(runs.required(context.scene, "take efficiencies from").file)
-        path = self.given_file("expected a name ending in .npy")
+        flood = storage.absolute(runs.required_run(context.scene, "take efficiencies from").file)
+        path = self.required_file("expected a name ending in .npy")
         order, scene_uid = self.order, context.scene.session_uid
 
         def finish(lines: list[str]) -> str:
-            scene = jobs.scene_again(scene_uid, "the efficiencies are")
+            scene = jobs.require_scene(scene_uid, "the efficiencies are")
             scene.mphdrr_projections.efficiency_of_modules = storage.stored_path(path)
             return " ".join(lines)
 
@@ -106,11 +106,11 @@ class MPHDRR_OT_compare_runs(jobs.JobOperator, bpy.types.Operator):
     other: EnumProperty(name="Other", description="Run to subtract", items=_other_runs, options={"SKIP_SAVE"})
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
-        minuend = runs.shown(context.scene)
+        minuend = runs.shown_run(context.scene)
         if minuend is None or not self.other:
             raise InputError("there is no other run to compare with: keep the shown one and render again")
         subtrahend = _required_run(context.scene, int(self.other))
-        paths = [rendering.file_of(item.file) for item in (minuend, subtrahend)]
+        paths = [rendering.run_file_path(item.file) for item in (minuend, subtrahend)]
         names = f"{minuend.name!r} minus {subtrahend.name!r}"
 
         def work(progress: Progress) -> Any:

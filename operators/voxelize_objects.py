@@ -33,7 +33,7 @@ class MPHDRR_OT_voxelize_objects(jobs.JobOperator, bpy.types.Operator):
     poll = reports.needs((lambda context: _chosen(context), "Select closed mesh objects first"))
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
-        return meshes.voxelizing(
+        return meshes.voxelize_job(
             _chosen(context), typed(self.value), self.quantity, self.voxels, typed(self.voxel_size), self.name
         )
 
@@ -51,7 +51,7 @@ class MPHDRR_OT_mesh_from_volume(jobs.JobOperator, bpy.types.Operator):
     poll = reports.needs(volumes.ACTIVE)
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
-        return meshes.extracting(context.object, typed(self.level) or None)
+        return meshes.mesh_job(context.object, typed(self.level) or None)
 
 
 def _chosen(context: bpy.types.Context) -> list[bpy.types.Object]:

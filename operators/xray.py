@@ -104,10 +104,10 @@ class MPHDRR_OT_use_ct(jobs.JobOperator, bpy.types.Operator):
 
     poll = needs(
         (
-            lambda context: spect_ct.chain(context.scene),
+            lambda context: spect_ct.spect_inputs(context.scene),
             "Reconstruct X-ray Counts first, beside pinholes and an activity",
         )
     )
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
-        return spect_ct.using_ct(context)
+        return spect_ct.use_ct_job(context)

@@ -26,7 +26,7 @@ class MPHDRR_PT_design(ScannerPanel, bpy.types.Panel):
             box = layout.box().column(align=True)
             box.label(text=properties.untidy.capitalize(), icon="ERROR")
             box.operator("mphdrr.tidy_modules", icon="BRUSH_DATA")
-        n_edited = sum(not following.shows_its_field(camera) for camera in scanner.modules(collection))
+        n_edited = sum(not following.has_field_of_view(camera) for camera in scanner.modules(collection))
         if n_edited:
             box = layout.box().column(align=True)
             cameras = f"{n_edited} camera{'s' * (n_edited > 1)}"
@@ -104,7 +104,7 @@ def _draw_pinholes(layout: bpy.types.UILayout, column: bpy.types.UILayout, prope
     )
 
 
-def _draw_module(layout: bpy.types.UILayout, camera: bpy.types.Object, kind: module_values.Kind) -> None:
+def _draw_module(layout: bpy.types.UILayout, camera: bpy.types.Object, kind: module_values.ScannerType) -> None:
     """Draw the values and readouts of one module, given by its camera."""
     module = camera.mphdrr_module
     _draw_values(layout, module, kind, mixed=())
@@ -125,13 +125,13 @@ def _draw_module(layout: bpy.types.UILayout, camera: bpy.types.Object, kind: mod
 
 
 def _draw_values(
-    layout: bpy.types.UILayout, values: bpy.types.PropertyGroup, kind: module_values.Kind, mixed: Sequence[str]
+    layout: bpy.types.UILayout, values: bpy.types.PropertyGroup, kind: module_values.ScannerType, mixed: Sequence[str]
 ) -> bpy.types.UILayout:
     """Draw the values of the columns in the table of a kind of scanner, those with a formula last.
 
     `mixed` are the fields whose values differ from module to module, which the labels say. Returns the drawn column.
     """
-    layout_column, with_formula = layouts.labelled(layout.column(align=True)), module_values.designed(kind)
+    layout_column, with_formula = layouts.labelled(layout.column(align=True)), module_values.formula_columns(kind)
     for column in kind.columns.scalars.values():
         if column not in with_formula:
             layout_column.prop(values, column.field, text=_label(column, mixed))

@@ -29,7 +29,7 @@ class _EpipolarPanel:
         row = layout.row(align=True)
         row.use_property_split = False
         layouts.draw_all(row, settings, "column", "row")
-        pixel, problem = epipolar.shown(context.scene)
+        pixel, problem = epipolar.picked_or_problem(context.scene)
         if problem:
             draw_text(layout, problem)
         if pixel is None:

@@ -19,7 +19,7 @@ class MPHDRR_PT_event_set(Folded, bpy.types.Panel):
         column = layout.column(align=True)
         column.prop(settings, "recipe", placeholder="None")
         column.operator_menu_enum("mphdrr.new_event_recipe", "like", text="New Recipe", icon="FILE_NEW")
-        recipe_note, set_note = event_notes.of_recipe(settings.recipe), event_notes.of_set(settings.folder)
+        recipe_note, set_note = event_notes.recipe_note(settings.recipe), event_notes.set_note(settings.folder)
         if recipe_note is not None:
             _draw_note(layout, recipe_note)
         layout.prop(settings, "folder")

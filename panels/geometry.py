@@ -23,7 +23,7 @@ class MPHDRR_UL_modules(bpy.types.UIList):
         row = layout.row(align=True)
         row.active = module.visible
         columns = row.row(align=True)
-        columns.alert = bool(module.problem or module.finding) or not following.shows_its_field(item)
+        columns.alert = bool(module.problem or module.finding) or not following.has_field_of_view(item)
         length = f"{module.collimator_length:.1f}" if pinholes.has_pinholes(kind_of(data)) else ""
         _draw_columns(columns, item.name, f"{module.pinhole_distance:.1f}", length)
         if columns.alert:

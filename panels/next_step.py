@@ -18,7 +18,7 @@ class MPHDRR_PT_next_step(Sidebar, bpy.types.Panel):
         layout, step = layouts.invoking(self.layout), next_step.next_step(context)
         is_empty = step.operator == "mphdrr.load_example"
         column = layout.column(align=True)
-        for stage in () if is_empty else next_step.stages(context):
+        for stage in () if is_empty else next_step.work_stages(context):
             _draw_stage(column, stage)
         if jobs.is_running():
             jobs.draw_job(layout)
@@ -37,10 +37,10 @@ class MPHDRR_PT_next_step(Sidebar, bpy.types.Panel):
             layout.operator("mphdrr.import_geometry", text="Import Geometry", icon="IMPORT")
 
 
-def _draw_stage(layout: bpy.types.UILayout, stage: next_step.Stage) -> None:
+def _draw_stage(layout: bpy.types.UILayout, stage: next_step.WorkStage) -> None:
     """Draw a stage's name with a mark: reached, out of date, or still open."""
     column = layout.column(align=True)
-    column.active, column.alert = bool(stage.found), stage.is_stale
-    icon = "ERROR" if stage.is_stale else "CHECKMARK" if stage.found else "RADIOBUT_OFF"
-    text = iface("{stage}: {found}").format(stage=iface(stage.name), found=stage.found) if stage.found else stage.name
+    column.active, column.alert = bool(stage.note), stage.is_stale
+    icon = "ERROR" if stage.is_stale else "CHECKMARK" if stage.note else "RADIOBUT_OFF"
+    text = iface("{stage}: {note}").format(stage=iface(stage.name), note=stage.note) if stage.note else stage.name
     draw_text(column, text, icon)

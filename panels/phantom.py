@@ -27,7 +27,7 @@ class MPHDRR_PT_phantom(Folded, bpy.types.Panel):
         row.operator("mphdrr.import_volume", text="Import Volume", icon="IMPORT")
         if storage.missing_volumes():
             _draw_missing(top.column(align=True), context.scene)
-        item = volumes.meant(context)
+        item = volumes.panel_volume(context)
         if item is not None:
             _draw_numbers(layout, item)
             row = layout.split(factor=0.32, align=True)
@@ -41,14 +41,14 @@ class MPHDRR_PT_phantom(Folded, bpy.types.Panel):
 
 def _draw_missing(column: bpy.types.UILayout, scene: bpy.types.Scene) -> None:
     """Draw the volumes whose files are gone: a button that makes phantoms again, and advice for other volumes."""
-    remakeable, lost = recovery.missing(scene)
+    remakeable, lost = recovery.missing_volumes(scene)
     column.alert = True
     column.label(text="Files of voxels are missing", icon="ERROR")
     if remakeable:
         text = iface("Make Again: {names}").format(names=", ".join(item.name for item in remakeable))
         column.operator("mphdrr.remake_volumes", text=text, icon="FILE_REFRESH")
     if lost:
-        draw_text(column, recovery.what_to_do(lost), "BLANK1")
+        draw_text(column, recovery.advice(lost), "BLANK1")
     column.operator("mphdrr.find_volume_files", icon="VIEWZOOM")
 
 
@@ -62,7 +62,7 @@ def _draw_numbers(layout: bpy.types.UILayout, item: bpy.types.Object) -> None:
         ("Size", " × ".join(f"{s:.3g}" for s in settings.spacing) + " mm"),
         ("Values", f"{settings.minimum:.4g} to {settings.maximum:.4g} {settings.unit}".removesuffix(" 1")),
         *([("State", volumes.state_text(item))] if item.data.is_sequence else []),
-        ("File", volumes.file_state(item)),
+        ("File", volumes.file_note(item)),
     )
     if settings.message:
         column = layout.column()
@@ -73,12 +73,12 @@ def _draw_numbers(layout: bpy.types.UILayout, item: bpy.types.Object) -> None:
 
 
 class _VolumePanel(Popover):
-    """Mixin of panels about the active volume (`volumes.meant`), which draw it in `draw_volume`."""
+    """Mixin of panels about the active volume (`volumes.panel_volume`), which draw it in `draw_volume`."""
 
-    poll = layouts.shown_where(volumes.meant)
+    poll = layouts.shown_where(volumes.panel_volume)
 
     def draw(self, context: bpy.types.Context) -> None:
-        layout, item = layouts.invoking(layouts.labelled(self.layout)), volumes.meant(context)  # type: ignore[attr-defined]
+        layout, item = layouts.invoking(layouts.labelled(self.layout)), volumes.panel_volume(context)  # type: ignore[attr-defined]
         if item is not None:  # the scene may have changed since poll
             layout.context_pointer_set("object", item)  # the buttons work on this volume, active or not
             self.draw_volume(layout, context, item)
@@ -112,7 +112,7 @@ class MPHDRR_PT_look(_VolumePanel, bpy.types.Panel):
             column.prop(item.data, "sequence_mode", text="Then")
         if slices.planes_of(item):
             column = layout.column(align=True)
-            for axis, name in enumerate(slices.names(item)):
+            for axis, name in enumerate(slices.plane_names(item)):
                 column.prop(settings, "slices", index=axis, text=name)
             column.operator("mphdrr.remove_slices", icon="X")
         else:
@@ -124,7 +124,7 @@ class MPHDRR_PT_phantom_settings(_VolumePanel, bpy.types.Panel):
 
     bl_label = "Settings"
 
-    poll = layouts.shown_where(lambda context: phantoms.settings_of(volumes.meant(context)) is not None)
+    poll = layouts.shown_where(lambda context: phantoms.settings_of(volumes.panel_volume(context)) is not None)
 
     def draw_volume(self, layout: bpy.types.UILayout, context: bpy.types.Context, item: bpy.types.Object) -> None:
         phantoms.settings_of(item).draw_settings(layout)
@@ -148,7 +148,7 @@ def _draw_update(layout: bpy.types.UILayout, item: bpy.types.Object) -> None:
 class MPHDRR_PT_perspective(_VolumePanel, bpy.types.Panel):
     """Show the volume in the coordinates of the active module: column, row and depth."""
 
-    poll = layouts.shown_where(lambda context: selection.active_module(context) and volumes.meant(context))
+    poll = layouts.shown_where(lambda context: selection.active_module(context) and volumes.panel_volume(context))
 
     def draw_volume(self, layout: bpy.types.UILayout, context: bpy.types.Context, item: bpy.types.Object) -> None:
         settings, camera = context.scene.mphdrr_perspective, selection.active_module(context)
@@ -169,7 +169,7 @@ class MPHDRR_PT_perspective(_VolumePanel, bpy.types.Panel):
 def _draw_frustum(column: bpy.types.UILayout, scene: bpy.types.Scene, frustum: bpy.types.Object) -> None:
     """Draw the volume and module of a frustum, and what has changed since it was made."""
     module = "?" if frustum.parent is None else frustum.parent.name
-    text = iface("Shown: {volume}, by {module}").format(volume=frustums.volume_of(frustum), module=module)
+    text = iface("Shown: {volume}, by {module}").format(volume=frustums.volume_name(frustum), module=module)
     column.label(text=text, translate=False)
     if changed := frustums.changes(scene, frustum):
         column.alert = True

@@ -5,7 +5,7 @@ from bpy.app.translations import pgettext_iface as iface
 
 from ..addon.blender import ids, layouts
 from ..addon.runs import preview, rendering, runs
-from ..addon.runs.projection_properties import drawn, makes_counts
+from ..addon.runs.projection_properties import makes_counts, panel_properties
 from ..addon.scanner import scanner
 from ..addon.volumes import volumes
 from .sidebar import Folded, Popover, draw_text
@@ -30,10 +30,10 @@ class MPHDRR_PT_projections(Folded, bpy.types.Panel):
         settings = context.scene.mphdrr_projections
         column = layout.column(align=True)
         column.prop(settings, "volume", placeholder="Active volume")
-        main = (setting for setting in drawn(settings, "model") if setting[0] in _MAIN)
+        main = (setting for setting in panel_properties(settings, "model") if setting[0] in _MAIN)
         layouts.draw_settings(column, settings, main)
         collection = scanner.active_scanner(context.scene)
-        pixels = collection and scanner.own_pixels(collection)
+        pixels = collection and scanner.fixed_pixels(collection)
         split = column.split(factor=0.4)
         name = split.row()
         name.alignment = "RIGHT"  # like the settings' names
@@ -57,7 +57,7 @@ class MPHDRR_PT_projections(Folded, bpy.types.Panel):
             column = layout.column(align=True)
             column.active = False
             draw_text(column, session.problem)
-            column.label(text=iface("{size} of voxels kept in memory").format(size=session.kept))
+            column.label(text=iface("{size} of voxels kept in memory").format(size=session.cache_size))
         if rendering.integrates_activity(context):
             draw_text(layout, "Line integrals of activity: for counts choose the model SPECT Counts.", icon="INFO")
         row = layout.row(align=True)
@@ -82,7 +82,7 @@ class MPHDRR_PT_physics(Popover, bpy.types.Panel):
         column = layout.column(align=True)
         if settings.model == "EMISSION":
             column.prop(settings, "mu", placeholder="None")
-        physics = (setting for setting in drawn(settings, "model") if setting[0] in _PHYSICS)
+        physics = (setting for setting in panel_properties(settings, "model") if setting[0] in _PHYSICS)
         layouts.draw_settings(column, settings, physics)
         row = layout.row(heading="Poisson Noise")
         row.active = makes_counts(settings)
@@ -102,7 +102,7 @@ class MPHDRR_PT_advanced(Popover, bpy.types.Panel):
         if settings.model == "EMISSION" and collection is not None:
             column.prop(collection.mphdrr_scanner, "opening_angle")
         for table in ("model", "frames", "detector", "compute"):
-            rest = (setting for setting in drawn(settings, table) if setting[0] not in (*_MAIN, *_PHYSICS))
+            rest = (setting for setting in panel_properties(settings, table) if setting[0] not in (*_MAIN, *_PHYSICS))
             layouts.draw_settings(column, settings, rest)
         column.prop(settings, "all_modules")
         if not settings.all_modules:

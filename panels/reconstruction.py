@@ -4,7 +4,7 @@ import bpy
 from bpy.app.translations import pgettext_iface as iface
 
 from ..addon.blender import ids, layouts, plots
-from ..addon.reconstruction.reconstruction_properties import drawn
+from ..addon.reconstruction.reconstruction_properties import panel_properties
 from ..addon.runs import runs
 from .sidebar import Folded, Popover, draw_text
 
@@ -18,23 +18,25 @@ _PLOT_HEIGHT = 3.0  # in units of a button's height
 class MPHDRR_PT_reconstruction(Folded, bpy.types.Panel):
     bl_order = ids.ORDER_RECONSTRUCTION
 
-    poll = layouts.shown_where(lambda context: runs.shown(context.scene) is not None)
+    poll = layouts.shown_where(lambda context: runs.shown_run(context.scene) is not None)
 
     def draw(self, context: bpy.types.Context) -> None:
         layout = layouts.labelled(self.layout)
         settings = context.scene.mphdrr_reconstruction
-        run = runs.shown(context.scene)
+        run = runs.shown_run(context.scene)
         if run is not None:  # the scene may have changed since poll
             layout.label(text=iface("Of {run}").format(run=run.name), translate=False, icon="RENDER_STILL")
         main = layout.column(align=True)
-        layouts.draw_settings(main, settings, (setting for setting in drawn(settings) if setting[0] in _MAIN))
+        layouts.draw_settings(
+            main, settings, (setting for setting in panel_properties(settings) if setting[0] in _MAIN)
+        )
         row = layouts.invoking(layout.row())
         row.scale_y = 1.4
         row.operator("mphdrr.reconstruct", text="Reconstruct", icon="OUTLINER_OB_VOLUME")
         row = layout.row(align=True)
         row.popover("MPHDRR_PT_backprojection")
         row.popover("MPHDRR_PT_reconstruction_model", icon="PREFERENCES")
-        result = settings.known
+        result = settings.details
         if result and settings.volume is not None:
             _draw_result(layout, settings, result)
 
@@ -80,7 +82,7 @@ class MPHDRR_PT_reconstruction_model(Popover, bpy.types.Panel):
 
     def draw(self, context: bpy.types.Context) -> None:
         settings = context.scene.mphdrr_reconstruction
-        rest = (setting for setting in drawn(settings) if setting[0] not in _MAIN)
+        rest = (setting for setting in panel_properties(settings) if setting[0] not in _MAIN)
         column = layouts.labelled(self.layout).column()
         if runs.holds_counts(context.scene):
             column.prop(settings, "mu", placeholder="The run's")

@@ -25,7 +25,7 @@ class MPHDRR_UL_runs(bpy.types.UIList):
         )
         size = row.row()
         size.alignment, size.active = "RIGHT", False
-        size.label(text=runs.size_text([item]))
+        size.label(text=runs.file_size_text([item]))
         row.prop(item, "keep", text="", icon="PINNED" if item.is_kept else "UNPINNED", emboss=False)
 
 
@@ -54,7 +54,7 @@ class _RunsPanel:
         row = layouts.invoking(layout.row(align=True))
         row.operator("mphdrr.show_projections", text="Show Mosaic", icon="IMAGE_DATA")
         if len(settings.runs) > 1:
-            column.label(text=iface("All runs: {size}").format(size=runs.size_text(settings.runs)))
+            column.label(text=iface("All runs: {size}").format(size=runs.file_size_text(settings.runs)))
             row = row.row(align=True)
             row.enabled = not jobs.is_running()
             row.operator_menu_enum("mphdrr.compare_runs", "other", text="Compare With", icon="SELECT_DIFFERENCE")

@@ -17,7 +17,7 @@ class MPHDRR_GGT_slices(bpy.types.GizmoGroup):
     bl_region_type = "WINDOW"
     bl_options = {"3D", "PERSISTENT"}
 
-    poll = shown_where(lambda context: slices.sliced(context) is not None)
+    poll = shown_where(lambda context: slices.active_sliced_volume(context) is not None)
 
     def setup(self, context: bpy.types.Context) -> None:
         for axis, color in enumerate(_COLORS):
@@ -27,19 +27,21 @@ class MPHDRR_GGT_slices(bpy.types.GizmoGroup):
             arrow.use_draw_modal = True
 
             def get(axis: int = axis) -> float:
-                item = slices.sliced(bpy.context)
-                return 0.0 if item is None else slices.way(item, axis)[1].length * item.mphdrr_volume.slices[axis]
+                item = slices.active_sliced_volume(bpy.context)
+                return (
+                    0.0 if item is None else slices.slice_track(item, axis)[1].length * item.mphdrr_volume.slices[axis]
+                )
 
             def set(value: float, axis: int = axis) -> None:
-                item = slices.sliced(bpy.context)
+                item = slices.active_sliced_volume(bpy.context)
                 if item is not None:
-                    slices.move(item, axis, value / slices.way(item, axis)[1].length)
+                    slices.move_slice(item, axis, value / slices.slice_track(item, axis)[1].length)
 
             arrow.target_set_handler("offset", get=get, set=set)
 
     def draw_prepare(self, context: bpy.types.Context) -> None:
-        item = slices.sliced(context)
+        item = slices.active_sliced_volume(context)
         for axis, arrow in enumerate(self.gizmos if item is not None else ()):
-            start, step = slices.way(item, axis)
+            start, step = slices.slice_track(item, axis)
             turn = Vector((0.0, 0.0, 1.0)).rotation_difference(step).to_matrix().to_4x4()
             arrow.matrix_basis = Matrix.Translation(start) @ turn

@@ -1,6 +1,6 @@
 """Compile the C kernels of the projector into the library of one platform, with the compiler in the package ziglang.
 
-Zig compiles for every platform on any other. The sources are in core/projector/backends/kernels/; each is compiled
+Zig compiles for every platform on any other. The sources are in core/rays/backends/kernels/; each is compiled
 once per level of processor and number type.
 """
 
@@ -20,7 +20,7 @@ from pathlib import Path
 
 WITHOUT_KERNELS = "MPHDRR_WITHOUT_KERNELS"
 """Environment variable that asks for a package without the library."""
-KERNELS = Path(__file__).resolve().parents[1] / "core/projector/backends/kernels"
+KERNELS = Path(__file__).resolve().parents[1] / "core/rays/backends/kernels"
 AVX2 = ("-mavx2", "-mfma", "-mprfchw")
 AVX512 = (*AVX2, "-mavx512f", "-mavx512vl", "-mavx512dq", "-mavx512bw")
 # No -ffast-math: linked into a library, it switches denormal numbers off for the whole process that loads it.

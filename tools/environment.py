@@ -18,7 +18,7 @@ import time
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
-KERNELS = ROOT / "core/projector/backends/kernels"
+KERNELS = ROOT / "core/rays/backends/kernels"
 VERSIONS = ("3.11", "3.13")
 VERSION_WITH_TORCH = "3.11"
 

@@ -1,15 +1,15 @@
-"""Numbers by which .blend files and Blender's preferences keep choices.
+"""Stable numbers by which .blend files and Blender's preferences store choices.
 
-Blender stores the number of an enumeration's item, by default its position: an isotope put between two others would make
-every saved scene count another isotope's photons. So every item has a number of its own: in the tables below, the one it
-had in version 0.1.0; of a later item, a checksum of its identifier. Later items need no change here.
+Blender stores the number of an enumeration's item, by default its position: an isotope inserted between two others would
+make every saved scene simulate another isotope. So every item has a number of its own: in the tables below, the one that it
+had in version 0.1.0; for a later item, a checksum of its identifier. Later items need no change here.
 """
 
 import zlib
 from collections.abc import Iterable, Mapping
 
 Items = tuple[tuple[str, str, str, int], ...]
-"""Identifier, label, description and number of each choice, as EnumProperty takes them."""
+"""Identifier, label, description and number of each choice, as `EnumProperty` takes them."""
 
 PARTS = {"NONE": 0, "CAMERA": 1, "COLLIMATOR": 2, "CRYSTAL": 3, "ROI": 4}
 QUANTITIES = {
@@ -21,7 +21,7 @@ KINDS = {
     "VOLUME": 0, "DERENZO": 1, "NEMA": 2, "JASZCZAK": 3, "DEFRISE": 4, "SHEPP_LOGAN": 5, "POINTS": 6, "TORSO": 7,
     "FILE": 1000,
 }  # fmt: skip
-PHANTOM_WORDS = {"modified": 0, "original": 1}  # that settings choose from (`core.phantoms.settings.choice`)
+PHANTOM_WORDS = {"modified": 0, "original": 1}  # words offered by `core.phantoms.settings.choice`
 ISOTOPES = {
     "NONE": 0, "F-18": 1, "Ga-67": 2, "Tc-99m": 3, "In-111": 4, "I-123": 5, "I-131": 6, "Xe-133": 7, "Lu-177": 8,
     "Tl-201": 9,
@@ -38,12 +38,12 @@ UNITS = {
 }  # fmt: skip
 
 
-_MOST = 0xFFFFFF
-"""Blender's buttons that show choices side by side keep numbers as float32: a larger one would be set as another."""
+_MASK = 0xFFFFFF
+"""The largest checksum: Blender's buttons that show choices side by side keep numbers as float32, exact up to here."""
 
 
-def items(numbers: Mapping[str, int], chosen: Iterable[tuple[str, str, str]]) -> Items:
-    """Items (identifier, label, description) with their numbers: a table's above, or else a checksum of the identifier."""
+def items(numbers: Mapping[str, int], rows: Iterable[tuple[str, str, str]]) -> Items:
+    """Return items (identifier, label, description, number); numbers come from a table above, else from a checksum."""
     return tuple(
-        (name, label, text, numbers.get(name, zlib.crc32(name.encode()) & _MOST)) for name, label, text in chosen
+        (name, label, text, numbers.get(name, zlib.crc32(name.encode()) & _MASK)) for name, label, text in rows
     )

@@ -4,5 +4,5 @@ import numpy as np
 
 
 def typed(value: float) -> float:
-    """The shortest decimal number that a float32 setting stands for: 0.1, not 0.10000000149."""
+    """Return the shortest decimal number that a float32 stands for: 0.1, not 0.10000000149."""
     return float(str(np.float32(value)))

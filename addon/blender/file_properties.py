@@ -1,4 +1,4 @@
-"""Properties that are paths: of operators, which Blender's file browser sets or reads, and of what the .blend keeps."""
+"""Properties that hold paths: those of operators, which the file browser sets or reads, and those kept in the .blend."""
 
 from collections.abc import Iterable
 from typing import Any
@@ -8,24 +8,24 @@ from bpy.props import CollectionProperty, StringProperty
 
 
 def file_property(description: str) -> Any:
-    """The `filepath` of an operator."""
+    """Return the `filepath` property of an operator."""
     return StringProperty(name="File", description=description, subtype="FILE_PATH", options={"SKIP_SAVE"})
 
 
 def files_property(description: str) -> Any:
-    """The `files` of an operator that takes several, which are in its `directory`."""
+    """Return the `files` property of an operator that takes several files of its `directory`."""
     return CollectionProperty(description=description, type=bpy.types.OperatorFileListElement, options={"SKIP_SAVE"})
 
 
-def path_property(name: str, description: str, *options: str, subtype: str = "FILE_PATH", **more: Any) -> Any:
-    """A path that the .blend keeps, which may be relative to it."""
-    every = {"PATH_SUPPORTS_BLEND_RELATIVE", *options}
-    return StringProperty(name=name, description=description, subtype=subtype, options=every, **more)
+def path_property(name: str, description: str, *options: str, subtype: str = "FILE_PATH", **keywords: Any) -> Any:
+    """Return a property for a path that the .blend keeps, which may be relative to the .blend."""
+    all_options = {"PATH_SUPPORTS_BLEND_RELATIVE", *options}
+    return StringProperty(name=name, description=description, subtype=subtype, options=all_options, **keywords)
 
 
-DIRECTORY = StringProperty(description="Where the files are", subtype="DIR_PATH", options={"SKIP_SAVE"})
+DIRECTORY = StringProperty(description="Folder of the files", subtype="DIR_PATH", options={"SKIP_SAVE"})
 
 
 def shown_files(endings: Iterable[str]) -> Any:
-    """The `filter_glob` of an operator: which files the browser shows, by the endings of their names."""
+    """Return the `filter_glob` property of an operator: the file browser shows only names with one of the `endings`."""
     return StringProperty(default=";".join(f"*{ending}" for ending in endings), options={"HIDDEN"})

@@ -1,4 +1,4 @@
-"""How panels and dialogs show settings."""
+"""Layouts of settings in panels and dialogs."""
 
 from collections.abc import Callable, Iterable
 from typing import Any
@@ -7,24 +7,24 @@ import bpy
 
 
 def shown_where(is_met: Callable[[bpy.types.Context], Any]) -> Any:
-    """The `poll` of a panel: in which contexts it is shown."""
+    """Return the `poll` of a panel that is shown in the contexts where `is_met` is true."""
     return classmethod(lambda panel, context: bool(is_met(context)))
 
 
 def labelled(layout: bpy.types.UILayout) -> bpy.types.UILayout:
-    """The layout, from now on with settings' names in a column of their own, and without the dots that animate them."""
+    """Return the layout, set to show settings' names in a column of their own, without the dots that animate them."""
     layout.use_property_split, layout.use_property_decorate = True, False
     return layout
 
 
 def invoking(layout: bpy.types.UILayout) -> bpy.types.UILayout:
-    """The layout, whose buttons from now on ask the user first where their operators do."""
+    """Return the layout, set to let its buttons open the dialogs of their operators."""
     layout.operator_context = "INVOKE_DEFAULT"
     return layout
 
 
 def draw_all(layout: bpy.types.UILayout, settings: Any, *names: str) -> None:
-    """Draw settings below each other, as they are called."""
+    """Draw settings below each other, under the names of their properties."""
     for name in names:
         layout.prop(settings, name)
 
@@ -32,21 +32,21 @@ def draw_all(layout: bpy.types.UILayout, settings: Any, *names: str) -> None:
 def draw_settings(
     layout: bpy.types.UILayout, settings: bpy.types.PropertyGroup, names: Iterable[tuple[str, bool]]
 ) -> None:
-    """Draw settings, each with whether it has an effect; those without are greyed out.
+    """Draw settings, given as (property name, whether it has an effect); those without effect are greyed out.
 
-    A number with a check mark, by `unset_name`, is shown only where the mark does not say that it is not given.
+    A number with a check mark, called `unset_name`, is shown only where the mark is not set.
     """
-    known = getattr(settings, "properties", settings).bl_rna.properties  # an operator keeps them apart
+    properties = getattr(settings, "properties", settings).bl_rna.properties  # an operator has its own in `properties`
     for name, is_active in names:
-        mark = unset_name(name)
-        row = layout.row(heading=known[name].name if mark in known else "")
+        mark_name = unset_name(name)
+        row = layout.row(heading=properties[name].name if mark_name in properties else "")
         row.active = is_active
-        if mark in known:
-            row.prop(settings, mark)
-        if not getattr(settings, mark, False):
-            row.prop(settings, name, **({"text": ""} if mark in known else {}))
+        if mark_name in properties:
+            row.prop(settings, mark_name)
+        if not getattr(settings, mark_name, False):
+            row.prop(settings, name, **({"text": ""} if mark_name in properties else {}))
 
 
 def unset_name(name: str) -> str:
-    """The check mark of a number: whether it is not given."""
+    """Return the property name of a number's check mark, which is set where the number is left out."""
     return f"{name}_unset"

@@ -1,4 +1,4 @@
-"""What core says to the user, as Blender's reports."""
+"""Warnings and errors of core as Blender's reports."""
 
 import re
 from collections.abc import Callable, Iterator
@@ -12,48 +12,48 @@ from ...core.recording import recorded_warnings
 from ...core.runs.settings import SETTINGS
 
 _OPTIONS = re.compile(r" \((?:--|mphdrr )[^()]*\)|, --[a-z-]+ [^;,)]+|, `mphdrr [^`]*`")
-_CLAUSES = re.compile(r"[;:,] [^;:,]*(?:--[a-z]|\bmphdrr [a-z])[^;]*")  # that speak of an option or a command
+_CLAUSES = re.compile(r"[;:,] [^;:,]*(?:--[a-z]|\bmphdrr [a-z])[^;]*")  # clauses with an option or a command
 _KEYS = "|".join(map(re.escape, sorted(SETTINGS, key=len, reverse=True)))
 _KEY = re.compile(rf"\b({_KEYS})(?![\w.])(?:\s?=\s?\"?([\w-]+)\"?)?")
-_MOST = 5  # nobody reads more lines than that
+_MAX_WARNINGS = 5  # lines; nobody reads more
 
 Need = tuple[Callable[[bpy.types.Context], Any], str]
-"""What an operator needs of the context, and the tooltip's words where that is not so."""
+"""Requirement of an operator: a test of the context, and the tooltip's text where the test fails."""
 
 
 def in_window(text: object) -> str:
-    """What core says, without the options of the command line, and with the window's words for a recipe's keys.
+    """Return a message of core in the window's words: without command-line options, with labels in place of recipe keys.
 
-    Of a recipe's file, which is a text with these keys, they stay.
+    A message about a .toml recipe keeps the keys, since the recipe's text has them.
     """
 
-    def labelled(found: re.Match[str]) -> str:
-        setting, word = SETTINGS[found[1]], found[2]
+    def labelled(match: re.Match[str]) -> str:
+        setting, word = SETTINGS[match[1]], match[2]
         label = setting.label.partition(" (")[0]
         return label if word is None else f"{label} {setting.words.get(word, (word,))[0]}"
 
-    said = _CLAUSES.sub("", _OPTIONS.sub("", str(text)))
-    return said if ".toml" in said else _KEY.sub(labelled, said)
+    message = _CLAUSES.sub("", _OPTIONS.sub("", str(text)))
+    return message if ".toml" in message else _KEY.sub(labelled, message)
 
 
 @contextmanager
 def warnings_reported(operator: bpy.types.Operator) -> Iterator[None]:
-    """Report every `InputWarning` of the block as {'WARNING'}, even if it raises; others pass through."""
-    with recorded_warnings() as caught:
+    """Report every `InputWarning` of the block as {'WARNING'}, even if it raises; other warnings pass through."""
+    with recorded_warnings() as warnings:
         try:
             yield
         finally:
-            for text in caught[:_MOST]:
+            for text in warnings[:_MAX_WARNINGS]:
                 operator.report({"WARNING"}, in_window(text))
-            if len(caught) > _MOST:
-                operator.report({"WARNING"}, f"... and {len(caught) - _MOST} more warnings of this kind")
+            if len(warnings) > _MAX_WARNINGS:
+                operator.report({"WARNING"}, f"... and {len(warnings) - _MAX_WARNINGS} more warnings of this kind")
 
 
-def needs(*every: Need) -> Any:
-    """The `poll` of an operator: whether every need is met; the tooltip shows the first that is not."""
+def needs(*requirements: Need) -> Any:
+    """Return the `poll` of an operator: whether all requirements are met; the tooltip shows the first unmet one."""
 
     def poll(operator: type[bpy.types.Operator], context: bpy.types.Context) -> bool:
-        unmet = next((text for is_met, text in every if not is_met(context)), None)
+        unmet = next((text for is_met, text in requirements if not is_met(context)), None)
         if unmet is not None:
             operator.poll_message_set(unmet)
         return unmet is None
@@ -62,7 +62,7 @@ def needs(*every: Need) -> Any:
 
 
 class Reported:
-    """Mix into an operator that does `act`, and reports the line that this returns, if it does, or what it raises."""
+    """Mix-in of an operator with a method `act(context)`, whose returned line, if any, or raised error is reported."""
 
     bl_options = {"REGISTER", "UNDO"}
 
@@ -72,7 +72,7 @@ class Reported:
 
 
 def run_reported(operator: bpy.types.Operator, action: Callable[[], str | None]) -> set[str]:
-    """Run an operator's work; report its warnings, and the line that it returns, or an `InputError` as {'ERROR'}."""
+    """Run an operator's work and report its warnings, and the line that it returns, or an `InputError` as {'ERROR'}."""
     try:
         with warnings_reported(operator):
             text = action()
@@ -87,7 +87,7 @@ def run_reported(operator: bpy.types.Operator, action: Callable[[], str | None])
 def ask_to_remove(
     operator: bpy.types.Operator, context: bpy.types.Context, event: bpy.types.Event, title: str, message: str
 ) -> set[str]:
-    """Open the dialog whose button removes something; for an operator's `invoke`."""
+    """Open a dialog whose button confirms a removal; for an operator's `invoke`."""
     return context.window_manager.invoke_confirm(
         operator, event, title=title, message=message, confirm_text="Remove", icon="WARNING"
     )

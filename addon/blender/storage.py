@@ -1,4 +1,4 @@
-"""Where the scene's large files are: beside the saved .blend, or in Blender's temporary folder until it is saved.
+"""The scene's large files: beside the saved .blend, or in Blender's temporary folder until it is saved.
 
 `study.blend` has them in `study_mphdrr/` next to it and points there by `//` paths, so that both can be moved together.
 Files made before the first save are copied there when it happens, and Save As copies those of the old folder, unless the
@@ -25,44 +25,46 @@ from . import ids
 
 _OUR_VOLUME = re.compile(r"[a-z]+-[0-9a-f]{16}(\.preview)?(_\d{4})?\.(vdb|h5)")
 """Names of the files that `stored_volumes` writes, made from their content."""
-_OUR_RUN = re.compile(r".*-projections-[0-9a-f]{8}\.h5")  # names of the files of runs
-_ENDING = re.compile(r"\.[A-Za-z]\w*$")  # of files, not of folders, nor of numbers in place of a file
-_FRAME = re.compile(r"_\d{4}\.vdb$")  # of a sequence, at the end of the name
+_OUR_RUN = re.compile(r".*-projections-[0-9a-f]{8}\.h5")  # names of run files
+_ENDING = re.compile(r"\.[A-Za-z]\w*$")  # a file's ending; a folder, or a number typed in place of a file, has none
+_FRAME = re.compile(r"_\d{4}\.vdb$")  # the frame number at the end of the names of a sequence's files
 
-_LOOK = 2.0  # s that a file's size, once read, is shown
+_SIZE_LIFETIME = 2.0  # s for which a file's size, once read, is shown
 
-_FOLDER = "_mphdrr"  # what the names of .blend files' folders end in
-_LARGE = 4 * 2**30  # bytes of a volume or file: on another disk, a Save As shares what is larger
-_STAY = {"recipe"}  # names of paths to texts that name files beside them
-_SHOWN = 15.0  # s that the line about a save stands in the status bar
+_FOLDER = "_mphdrr"  # the end of the names of .blend files' folders
+_LARGE = 4 * 2**30  # bytes; Save As onto another disk shares larger volumes and files instead of copying them
+_UNCOPIED = {"recipe"}  # properties with the path of a text that refers to files beside itself
+_NOTE_TIME = 15.0  # s for which the status bar shows the line about a save
 
 copies = True
-"""Whether Save As copies files, as the preferences say; else they are shared."""
+"""Whether Save As copies files, as the preferences say; if not, both .blend files share them."""
 
 
-class _Changed(NamedTuple):
+class _ChangedPath(NamedTuple):
+    """A path in the .blend's data that a save has changed."""
+
     owner: Any
-    name: str  # of the owner's property
-    old: str
-    path: Path  # of the file, or folder, that it names from now on
+    name: str  # the name of the owner's property
+    old: str  # the property's value before the save
+    path: Path  # the file or folder that the property names now
 
 
-_before_save: list[_Changed] = []  # paths that the save that is running has changed
-_said = (0.0, "")  # about the last save: when, in s, and what
+_changed_paths: list[_ChangedPath] = []  # paths changed by the save that is going on
+_save_note = (0.0, "")  # the time of the last save, s, and the line about it
 
 
 def folder() -> Path:
-    """The folder for this .blend's large files, made if need be."""
+    """Return the folder for this .blend's large files; make it if there is none."""
     return ensure_folder(_folder())
 
 
-def is_own(path: Path) -> bool:
-    """Whether a file is in the folder for this .blend's large files."""
+def is_in_folder(path: Path) -> bool:
+    """Return whether a file is in the folder for this .blend's large files."""
     return path.resolve().parent == _folder().resolve()
 
 
 def stored_path(path: Path) -> str:
-    """How the .blend should name a file: `//...` when it is saved and the file lies below it, else absolute."""
+    """Return the path to store in the .blend: `//...` for a file below the folder of the saved .blend, else absolute."""
     if bpy.data.filepath:
         top = Path(bpy.data.filepath).parent
         if path.is_relative_to(top):
@@ -71,158 +73,163 @@ def stored_path(path: Path) -> str:
 
 
 def absolute(path: str) -> Path:
-    """A path as stored in the .blend, made absolute."""
+    """Return a path that is stored in the .blend as an absolute one."""
     return Path(bpy.path.abspath(path))
 
 
-def full_resolution(path: Path) -> Path:
-    """The .vdb with every voxel that belongs to the one that Blender shows (which may be a coarser copy)."""
+def full_resolution_file(path: Path) -> Path:
+    """Return the .vdb with every voxel for the .vdb that Blender shows, which may be a coarser copy."""
     return path.with_name(path.name.replace(ids.PREVIEW, "", 1))
 
 
-def resumable(path: Path) -> Path:
-    """The file beside a reconstruction's .vdb from which it goes on."""
-    return full_resolution(path).with_suffix(".h5")
+def resume_file(path: Path) -> Path:
+    """Return the file beside a reconstruction's .vdb from which the reconstruction can be continued."""
+    return full_resolution_file(path).with_suffix(".h5")
 
 
-def of_frame(path: Path, number: int) -> Path:
-    """The file of a sequence with that number."""
+def frame_file(path: Path, number: int) -> Path:
+    """Return the file of a sequence's frame."""
     return path.with_name(_FRAME.sub(f"_{number:04d}.vdb", path.name))
 
 
-def size_of(path: Path) -> int | None:
-    """Bytes of a file, None where there is none. Panels are drawn often: looks at the disk are two seconds apart."""
-    return _size_at(path, time.monotonic() // _LOOK)
+def file_size(path: Path) -> int | None:
+    """Return a file's size in bytes, None where there is no file; the disk is asked every two seconds at most."""
+    return _cached_size(path, time.monotonic() // _SIZE_LIFETIME)
 
 
 @functools.lru_cache(maxsize=4096)
-def _size_at(path: Path, now: float) -> int | None:
+def _cached_size(path: Path, interval: float) -> int | None:
+    """Return a file's size; `interval`, the number of the present two seconds, lets the cache forget older sizes."""
     return path.stat().st_size if path.is_file() else None
 
 
 def missing_volumes() -> list[bpy.types.Volume]:
-    """Volumes of ours of which a file, shown or with every voxel, is missing, by `size_of`."""
-    ours = [data for data in bpy.data.volumes if _OUR_VOLUME.fullmatch(absolute(data.filepath).name)]
-    return [data for data in ours if any(size_of(path) is None for path in _files_of(data))]
+    """Return our volumes that miss a file, the shown one or the one with every voxel."""
+    our_volumes = [data for data in bpy.data.volumes if _OUR_VOLUME.fullmatch(absolute(data.filepath).name)]
+    return [data for data in our_volumes if any(file_size(path) is None for path in _files_of(data))]
 
 
 def relocate(directory: str) -> str:
-    """Look for missing files by name, in a folder and all below it; returns whose were found."""
+    """Look for missing files by name in a folder and all below it; return the line to report."""
     top = absolute(directory)
     if not directory or not top.is_dir():
         raise InputError(f"{directory or 'no folder given'}: expected a folder to look in")
-    found = _find(top.rglob("*"))
+    found_names = _relink(top.rglob("*"))
     if absent := sorted(data.name for data in missing_volumes()):
         warn(f"{top}: the files of {', '.join(absent)} are not there either")
-    return f"Found the files of {', '.join(sorted(found)) or 'no volume'}"
+    return f"Found the files of {', '.join(sorted(found_names)) or 'no volume'}"
 
 
-def _find(files: Iterable[Path]) -> set[str]:
-    """Have paths that lead nowhere lead to files of that name; returns the names of volumes and runs whose were found."""
-    lost = []
-    for owner, name in references():
-        wanted = _files_of(owner) if isinstance(owner, bpy.types.Volume) else {absolute(getattr(owner, name))}
-        if not all(path.exists() for path in wanted):
-            lost.append((owner, name, set(map(_name, wanted))))
-    names = {name for _, _, all_of_it in lost for name in all_of_it}
-    there = {path.name: path for path in sorted((path for path in files if path.name in names), reverse=True)}
-    found = set()
-    for owner, name, all_of_it in lost:
-        path = there.get(_name(getattr(owner, name)))  # the files of one volume are in one folder
-        if path is not None and all(path.with_name(each).is_file() for each in all_of_it):
+def _relink(files: Iterable[Path]) -> set[str]:
+    """Make broken paths lead to the `files` of the same name; return the names of the repaired volumes and runs."""
+    broken = []
+    for owner, name in file_references():
+        paths = _files_of(owner) if isinstance(owner, bpy.types.Volume) else {absolute(getattr(owner, name))}
+        if not all(path.exists() for path in paths):
+            broken.append((owner, name, set(map(_file_name, paths))))
+    names = {name for _, _, file_names in broken for name in file_names}
+    path_by_name = {path.name: path for path in sorted((path for path in files if path.name in names), reverse=True)}
+    relinked = set()
+    for owner, name, file_names in broken:
+        path = path_by_name.get(_file_name(getattr(owner, name)))  # the files of one volume are in one folder
+        if path is not None and all(path.with_name(file_name).is_file() for file_name in file_names):
             setattr(owner, name, stored_path(path))
-            found.add(getattr(owner, "name", ""))
-    _size_at.cache_clear()
-    return found - {""}
+            relinked.add(getattr(owner, "name", ""))
+    _cached_size.cache_clear()
+    return relinked - {""}
 
 
-def _name(path: str | Path) -> str:
-    """The last part of a path of any system."""
+def _file_name(path: str | Path) -> str:
+    """Return the last part of a path of any operating system."""
     return re.split(r"[\\/]", str(path))[-1]
 
 
 def unused_volumes() -> list[Path]:
-    """Files of voxels and of runs in this .blend's folder that none of its volumes and lists of runs needs."""
-    used = {path.name for data in bpy.data.volumes for path in _all_of(data)}
-    used |= {absolute(run.file).name for scene in bpy.data.scenes for run in scene.mphdrr_projections.runs}
-    ours = [p for p in _folder().glob("*") if _OUR_VOLUME.fullmatch(p.name) or _OUR_RUN.fullmatch(p.name)]
-    return sorted(path for path in ours if path.is_file() and path.name not in used)
+    """Return the voxel files and run files in this .blend's folder that none of its volumes and lists of runs needs."""
+    used_names = {path.name for data in bpy.data.volumes for path in _files_and_resume_files(data)}
+    used_names |= {absolute(run.file).name for scene in bpy.data.scenes for run in scene.mphdrr_projections.runs}
+    our_files = [p for p in _folder().glob("*") if _OUR_VOLUME.fullmatch(p.name) or _OUR_RUN.fullmatch(p.name)]
+    return sorted(path for path in our_files if path.is_file() and path.name not in used_names)
 
 
 def remove_unused() -> str:
-    """Remove the `unused_volumes`, unless the .blend, as it is saved, may need them; returns how many there were."""
-    # Without a window Blender does not keep account of changes.
+    """Remove the unused voxel files and run files, and return the line to report.
+
+    `InputError` if the .blend has unsaved changes: as saved on disk, it may still need the files.
+    """
+    # Without a window, Blender does not keep `is_dirty` up to date.
     if bpy.data.filepath and bpy.data.is_dirty and not bpy.app.background:
         raise InputError("the .blend has changes that are not saved, and as saved may need these files: save it")
-    unused = unused_volumes()
-    text = f"Removed {summary(unused)}" if unused else "No file of voxels or runs is unused"
-    for path in unused:
+    files = unused_volumes()
+    text = f"Removed {summarize_unused(files)}" if files else "No file of voxels or runs is unused"
+    for path in files:
         with refusing(path, "cannot be removed"):
             path.unlink(missing_ok=True)
     return text
 
 
-def summary(files: list[Path]) -> str:
-    """How many unused files there are, and how large they are."""
+def summarize_unused(files: list[Path]) -> str:
+    """Return the number and size of unused files in words."""
     return f"{_amount({path: path.stat().st_size for path in files})} of voxels or runs that nothing needs"
 
 
-def files_of_states(data: bpy.types.Volume) -> list[Path]:
-    """The .vdb with every voxel, of each state of a sequence."""
-    return _of_states(data, full_resolution(absolute(data.filepath)))
+def state_files(data: bpy.types.Volume) -> list[Path]:
+    """Return the .vdb files with every voxel of all states of a sequence; of another volume, its one file."""
+    return _sequence_files(data, full_resolution_file(absolute(data.filepath)))
 
 
 def _files_of(data: bpy.types.Volume) -> set[Path]:
-    """The files that a volume needs: of every state, the one that is shown and the one with every voxel."""
-    return {*files_of_states(data), *_of_states(data, absolute(data.filepath))}
+    """Return the files that a volume needs: for every state, the shown one and the one with every voxel."""
+    return {*state_files(data), *_sequence_files(data, absolute(data.filepath))}
 
 
-def _all_of(data: bpy.types.Volume) -> set[Path]:
-    """The files that a volume needs, and, of a reconstruction, that from which it goes on, if there is one."""
-    needed = _files_of(data)
-    return needed | set(filter(Path.is_file, map(resumable, needed)))
+def _files_and_resume_files(data: bpy.types.Volume) -> set[Path]:
+    """Return the files that a volume needs, and the existing ones from which its reconstruction can be continued."""
+    files = _files_of(data)
+    return files | set(filter(Path.is_file, map(resume_file, files)))
 
 
-def _of_states(data: bpy.types.Volume, path: Path) -> list[Path]:
+def _sequence_files(data: bpy.types.Volume, path: Path) -> list[Path]:
+    """Return the files of all states of a sequence, of which `path` is one; of another volume, `path` alone."""
     if not data.is_sequence:
         return [path]
-    return [of_frame(path, data.frame_offset + 1 + k) for k in range(data.frame_duration)]
+    return [frame_file(path, data.frame_offset + 1 + k) for k in range(data.frame_duration)]
 
 
-def references() -> Iterator[tuple[Any, str]]:
-    """Every path in this .blend's own data that names a file or a folder: its owner, and its property's name."""
+def file_references() -> Iterator[tuple[Any, str]]:
+    """Yield (owner, property name) for every path in this .blend's own data that names a file or a folder."""
     images = [image for image in bpy.data.images if image.source == "FILE" and image.packed_file is None]
     scenes = [scene.mphdrr_projections for scene in bpy.data.scenes]
     scenes += [run for settings in scenes for run in settings.runs]
     scenes += [x for scene in bpy.data.scenes for x in (scene.mphdrr_reconstruction, scene.mphdrr_events)]
     for owner in (*bpy.data.volumes, *images, *scenes, *(c.mphdrr_scanner for c in bpy.data.collections)):
-        known = owner.bl_rna.properties
-        paths = ["filepath"] if owner == owner.id_data else [p.identifier for p in known if "_PATH" in p.subtype]
+        properties = owner.bl_rna.properties
+        paths = ["filepath"] if owner == owner.id_data else [p.identifier for p in properties if "_PATH" in p.subtype]
         yield from ((owner, name) for name in paths if owner.id_data.library is None and getattr(owner, name))
 
 
 @dataclass
-class _Kept:
-    """Which files were copied into a .blend's folder, and which stay where they are."""
+class _GatheredFiles:
+    """Files copied into a .blend's folder, and files left in their places."""
 
-    copied: dict[Path, int] = field(default_factory=dict)  # their sizes in bytes
-    shared: dict[Path, int] = field(default_factory=dict)  # files of other .blend files' folders
-    outside: dict[Path, int] = field(default_factory=dict)  # the user's own
-    missing: list[str] = field(default_factory=list)
-    problems: list[str] = field(default_factory=list)
+    copied: dict[Path, int] = field(default_factory=dict)  # sizes, bytes, of the copies
+    shared: dict[Path, int] = field(default_factory=dict)  # sizes, bytes, of files in other .blend files' folders
+    outside: dict[Path, int] = field(default_factory=dict)  # sizes, bytes, of files anywhere else
+    missing: list[str] = field(default_factory=list)  # names of missing files
+    problems: list[str] = field(default_factory=list)  # messages about files that could not be copied
 
     @property
     def absent(self) -> str:
-        """Which files are missing; "" for none."""
+        """The missing files in words; "" for none."""
         return f"missing: {several(dict.fromkeys(self.missing), 6)}" if self.missing else ""
 
     @property
     def text(self) -> str:
-        """What was done, in a line; "" for nothing."""
-        target, homes = (", ".join(sorted({path.parent.name for path in each})) for each in (self.copied, self.shared))
+        """The copied, shared and missing files in a line; "" for none."""
+        target, owners = (", ".join(sorted({path.parent.name for path in x})) for x in (self.copied, self.shared))
         amounts = {
             f"copied {_amount(self.copied)} into {target}": self.copied,
-            f"shares {_amount(self.shared)} with {homes}": self.shared,
+            f"shares {_amount(self.shared)} with {owners}": self.shared,
             f"{_amount(self.outside)} elsewhere: Collect Files copies them": self.outside,
         }
         return "; ".join(
@@ -231,65 +238,66 @@ class _Kept:
 
 
 def _amount(files: dict[Path, int]) -> str:
+    """Return the number of files and their total size in words."""
     return f"{len(files)} file{'s' * (len(files) > 1)} ({readable_size(sum(files.values()))})"
 
 
-def _keep_together(target: Path, is_wanted: Callable[[str, Path], bool]) -> _Kept:
-    """Copy the wanted files into the folder `target` of a .blend, and have all paths lead to where files are, from there."""
-    kept, changed = _Kept(), []
-    for owner, name in references():
+def _gather_files(target: Path, is_wanted: Callable[[str, Path], bool]) -> _GatheredFiles:
+    """Copy the wanted files into the folder `target` of a .blend, and make paths relative to this .blend where possible."""
+    gathered, changes = _GatheredFiles(), []
+    for owner, name in file_references():
         old = getattr(owner, name)
         path = absolute(old)
-        files = _all_of(owner) if isinstance(owner, bpy.types.Volume) else {path}
+        files = _files_and_resume_files(owner) if isinstance(owner, bpy.types.Volume) else {path}
         sizes = {file: file.stat().st_size for file in files if file.is_file()}
         if sizes.keys() < files and _ENDING.search(path.name):
-            kept.missing.append(path.name)
+            gathered.missing.append(path.name)
         elif sizes and path.parent.resolve() != target.resolve():
-            stays = kept.shared if path.parent.name.endswith(_FOLDER) else kept.outside
+            unmoved = gathered.shared if path.parent.name.endswith(_FOLDER) else gathered.outside
             try:
                 if is_wanted(name, path) and not _is_too_large(path, sum(sizes.values()), target):
-                    brought = {file: _bring(file, target) for file in files}
-                    kept.copied |= {brought[file]: size for file, size in sizes.items()}
-                    path, sizes = brought.get(path, target / path.name), {}
+                    copied_files = {file: _copy_into(file, target) for file in files}
+                    gathered.copied |= {copied_files[file]: size for file, size in sizes.items()}
+                    path, sizes = copied_files.get(path, target / path.name), {}
             except InputError as error:  # such as a full disk
-                kept.problems.append(str(error))
-            stays |= sizes
+                gathered.problems.append(str(error))
+            unmoved |= sizes
         is_near = owner != owner.id_data and path.is_relative_to(target.parent)
         if old.startswith("//") or path != absolute(old) or is_near:
-            changed.append(_Changed(owner, name, old, path))
-    _before_save[:] = changed
-    for each in changed:
+            changes.append(_ChangedPath(owner, name, old, path))
+    _changed_paths[:] = changes
+    for change in changes:
         # Where a Save As leads to another folder, Blender itself rewrites the paths of datablocks from the old one.
-        own = each.owner == each.owner.id_data
-        new = _below(Path(bpy.data.filepath).parent if own and bpy.data.filepath else target.parent, each.path)
-        if new != getattr(each.owner, each.name):
-            setattr(each.owner, each.name, new)
-    return kept
+        is_rewritten = bpy.data.filepath and change.owner == change.owner.id_data
+        new = _relative_path(Path(bpy.data.filepath).parent if is_rewritten else target.parent, change.path)
+        if new != getattr(change.owner, change.name):
+            setattr(change.owner, change.name, new)
+    return gathered
 
 
-def collect() -> str:
-    """Copy all files that the scene uses into this .blend's folder, from where it names them by `//`; returns what was done.
+def collect_files() -> str:
+    """Copy all files that the scene uses into this .blend's folder, name them by `//`, and return the line to report.
 
-    What is missing, and what stays where it is, is said in a warning.
+    A warning names missing files and files that stay outside the folder.
     """
-    global _said
-    kept = _keep_together(_folder(), lambda name, path: name not in _STAY)
-    _said = (0.0, "")  # it may have asked for this
-    _before_save.clear()
-    known = _folder().parent, bpy.utils.system_resource("DATAFILES")  # which has Blender's own brushes
-    others = {Path(path) for path in bpy.utils.blend_paths(absolute=True, packed=False)} | kept.outside.keys()
-    others = {path for path in others if not any(map(path.is_relative_to, known)) and path.name not in kept.missing}
-    stay = [f"outside the .blend's folder stay: {several(sorted(others), 6)}"] if others else []
-    for text in (*stay, *filter(None, [kept.absent, *kept.problems])):
+    global _save_note
+    gathered = _gather_files(_folder(), lambda name, path: name not in _UNCOPIED)
+    _save_note = (0.0, "")  # the note may have asked for Collect Files
+    _changed_paths.clear()
+    inside = _folder().parent, bpy.utils.system_resource("DATAFILES")  # Blender's own brushes are in the latter
+    paths = {Path(path) for path in bpy.utils.blend_paths(absolute=True, packed=False)} | gathered.outside.keys()
+    paths = {path for path in paths if not any(map(path.is_relative_to, inside)) and path.name not in gathered.missing}
+    notes = [f"outside the .blend's folder stay: {several(sorted(paths), 6)}"] if paths else []
+    for text in (*notes, *filter(None, [gathered.absent, *gathered.problems])):
         warn(text)
-    names = several(sorted(path.name for path in kept.copied), 6)
-    return f"Copied {_amount(kept.copied)} into {_folder()}: {names}. Save the .blend" if names else "All are there"
+    names = several(sorted(path.name for path in gathered.copied), 6)
+    return f"Copied {_amount(gathered.copied)} into {_folder()}: {names}. Save the .blend" if names else "All are there"
 
 
 def before_save(filepath: str, _: Any = None) -> None:
-    """Copy files from the temporary folder, of a Save As those of the old .blend, too, and keep paths up to date."""
-    global _said
-    _before_save.clear()
+    """Copy files from the temporary folder, for a Save As also those of the old .blend, and make paths lead to them."""
+    global _save_note
+    _changed_paths.clear()
     if not filepath:
         return
     is_new = filepath != bpy.data.filepath
@@ -297,46 +305,46 @@ def before_save(filepath: str, _: Any = None) -> None:
     def is_wanted(name: str, path: Path) -> bool:
         return _is_temporary(path) or (is_new and copies and path.parent.name.endswith(_FOLDER))
 
-    kept = _keep_together(_folder_of(filepath), is_wanted)
+    gathered = _gather_files(_folder_of(filepath), is_wanted)
     for scene in bpy.data.scenes:
         for run in scene.mphdrr_projections.runs:
             run.is_saved = True
-    if text := kept.text if is_new or kept.problems else "":
-        _said = time.monotonic(), text[:1].upper() + text[1:]
-        print(f"mphDRR: {_said[1]}")
+    if text := gathered.text if is_new or gathered.problems else "":
+        _save_note = time.monotonic(), text[:1].upper() + text[1:]
+        print(f"mphDRR: {_save_note[1]}")
 
 
-def draw_said(header: bpy.types.Header, context: bpy.types.Context) -> None:
-    """Draw in Blender's status bar what the last save did with files."""
-    if time.monotonic() < _said[0] + _SHOWN:
-        header.layout.label(text=_said[1], translate=False, icon="FILE_TICK")
+def draw_save_note(header: bpy.types.Header, context: bpy.types.Context) -> None:
+    """Draw the line about the last save's files in Blender's status bar."""
+    if time.monotonic() < _save_note[0] + _NOTE_TIME:
+        header.layout.label(text=_save_note[1], translate=False, icon="FILE_TICK")
 
 
 def after_save(filepath: str, _: Any = None) -> None:
-    """Set paths back after "Save Copy", when this session still belongs to another file or to none."""
+    """Restore paths after "Save Copy", when this session still belongs to another file or to none."""
     if not filepath or bpy.data.filepath != filepath:
         restore_paths()
-    for each in _before_save:
+    for change in _changed_paths:
         # `//` may not have led there yet when the path was set, so Blender could not read the voxels: set it again.
-        if each.owner == each.owner.id_data:
-            setattr(each.owner, each.name, _below(Path(filepath).parent, each.path))
-    _before_save.clear()
+        if change.owner == change.owner.id_data:
+            setattr(change.owner, change.name, _relative_path(Path(filepath).parent, change.path))
+    _changed_paths.clear()
 
 
 def restore_paths(*_: Any) -> None:
-    """Set paths back as they were before a save, for example when Blender could not write the .blend."""
-    for each in _before_save:
-        setattr(each.owner, each.name, each.old)
-    _before_save.clear()
+    """Restore paths as they were before a save, for example when Blender could not write the .blend."""
+    for change in _changed_paths:
+        setattr(change.owner, change.name, change.old)
+    _changed_paths.clear()
 
 
 def after_load(*_: Any) -> None:
-    """Find the files of a .blend that was renamed with its folder: those that are missing where they were, and lie there."""
-    _find(_folder().glob("*") if bpy.data.filepath else ())
+    """Relink missing files that lie in the folder of a .blend which was renamed together with it."""
+    _relink(_folder().glob("*") if bpy.data.filepath else ())
 
 
-def _below(folder: Path, path: Path) -> str:
-    """How a .blend in a folder names a file."""
+def _relative_path(folder: Path, path: Path) -> str:
+    """Return the `//` path by which a .blend in a folder names a file; the absolute path for a file on another drive."""
     try:
         return "//" + Path(os.path.relpath(path, folder)).as_posix()
     except ValueError:  # another drive
@@ -344,38 +352,43 @@ def _below(folder: Path, path: Path) -> str:
 
 
 def _is_too_large(file: Path, size: int, target: Path) -> bool:
+    """Return whether a file is too large to be copied onto another disk."""
     return size > _LARGE and file.stat().st_dev != target.parent.stat().st_dev
 
 
-def _bring(file: Path, target: Path) -> Path:
-    """Copy a file into a folder, under another name where there is another one of its name; returns the copy's path."""
+def _copy_into(file: Path, target: Path) -> Path:
+    """Copy a file into a folder, under a new name if a different file has its name, and return the copy's path."""
     is_ours = _OUR_VOLUME.fullmatch(file.name) or _OUR_RUN.fullmatch(file.name)
     path, number = ensure_folder(target) / file.name, 2
     while path.exists():
         if is_ours or filecmp.cmp(file, path, shallow=False):
-            return path  # named by its content, or a run's own name
+            return path  # our names are unique: made from the content or at random
         path, number = path.with_name(f"{file.stem}-{number}{file.suffix}"), number + 1
     with replacing(path) as temporary:
         try:
             if not is_ours or not os.access(file, os.W_OK):
                 raise OSError
-            os.link(file, temporary)  # nobody changes ours, so one on the disk is enough for both names
+            os.link(file, temporary)  # our files never change, so both names may share one file on the disk
         except OSError:
             shutil.copyfile(file, temporary)
     return path
 
 
 def _folder() -> Path:
+    """Return the path of this .blend's folder for large files, which need not exist."""
     return _folder_of(bpy.data.filepath) if bpy.data.filepath else _temporary_folder()
 
 
 def _folder_of(blend: str) -> Path:
+    """Return the path of the folder for large files of the .blend file `blend`."""
     return Path(blend).with_name(Path(blend).stem + _FOLDER)
 
 
 def _temporary_folder() -> Path:
+    """Return the folder for large files until the .blend is saved."""
     return Path(bpy.app.tempdir) / "mphdrr"
 
 
 def _is_temporary(path: Path) -> bool:
+    """Return whether a path lies in the temporary folder."""
     return path.is_absolute() and path.is_relative_to(_temporary_folder())

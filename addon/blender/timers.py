@@ -1,28 +1,28 @@
-"""Functions that Blender calls once it has time, in its main thread; where there is no window, it does so never."""
+"""Functions that Blender calls in its main thread once it has time; without a window it never calls them."""
 
 from collections.abc import Callable
 
 import bpy
 
-_Function = Callable[[], float | None]  # returns the seconds until it is called again, or None
-_known: set[_Function] = set()
+_TimerFunction = Callable[[], float | None]  # returns the seconds until its next call, or None for no further call
+_scheduled: set[_TimerFunction] = set()
 
 
-def soon(function: _Function, seconds: float = 0.0) -> None:
-    """Have a function called in so many seconds, unless it waits already."""
-    _known.add(function)
+def schedule(function: _TimerFunction, seconds: float = 0.0) -> None:
+    """Have a function called after some seconds, unless it is scheduled already."""
+    _scheduled.add(function)
     if not bpy.app.timers.is_registered(function):
         bpy.app.timers.register(function, first_interval=seconds)
 
 
-def forget(function: _Function) -> None:
-    """Do not have a function called, where it waits."""
+def cancel(function: _TimerFunction) -> None:
+    """Cancel the call of a function that is scheduled."""
     if bpy.app.timers.is_registered(function):
         bpy.app.timers.unregister(function)
 
 
 def stop() -> None:
-    """Forget all that wait: the extension is disabled."""
-    for function in _known:
-        forget(function)
-    _known.clear()
+    """Cancel all scheduled calls when the extension is disabled."""
+    for function in _scheduled:
+        cancel(function)
+    _scheduled.clear()

@@ -1,4 +1,4 @@
-"""What an edited property, or a room below, calls: functions by name, so that nobody imports what draws or rebuilds."""
+"""Functions, by name, that edited properties and lower rooms call, so that these need not import what draws or rebuilds."""
 
 from collections.abc import Callable
 from typing import Any
@@ -6,15 +6,16 @@ from typing import Any
 import bpy
 
 FUNCTIONS: dict[str, Callable[..., None]] = {}
-"""Filled by `registration.py`. Those of properties take the property's object, collection or scene, and what was given to
-`on_edit`.
+"""Functions by name, filled by `registration.py`.
+
+A function that a property calls takes the property's object, collection or scene, and the arguments of `on_edit`.
 """
 
 
 def on_edit(name: str, *arguments: Any) -> Callable[[bpy.types.PropertyGroup, bpy.types.Context], None]:
-    """A property's ``update=``: calls ``FUNCTIONS[name](group.id_data, *arguments)``."""
+    """Return a property's ``update=`` function, which calls ``FUNCTIONS[name](group.id_data, *arguments)``."""
 
-    def edited(group: bpy.types.PropertyGroup, context: bpy.types.Context) -> None:
+    def update(group: bpy.types.PropertyGroup, context: bpy.types.Context) -> None:
         FUNCTIONS[name](group.id_data, *arguments)
 
-    return edited
+    return update

@@ -1,4 +1,4 @@
-"""The editors in Blender's windows: to have them drawn again, and to draw lines over them."""
+"""Redrawing of the editors in Blender's windows, and lines and texts drawn over them."""
 
 from collections.abc import Iterable, Iterator
 from typing import Any
@@ -10,18 +10,18 @@ from gpu_extras.batch import batch_for_shader
 
 
 def has_window() -> bool:
-    """Whether there is a window, which alone has Blender's timers run and shows what changes."""
+    """Return whether Blender has a window: without one, no timer runs and nothing is drawn."""
     return not bpy.app.background
 
 
 def areas(*types: str) -> Iterator[bpy.types.Area]:
-    """The editors of some types, in all windows."""
+    """Yield the editors of the given types in all windows."""
     for window in bpy.context.window_manager.windows:
         yield from (area for area in window.screen.areas if area.type in types)
 
 
 def redraw(*types: str) -> None:
-    """Have the editors of some types drawn again."""
+    """Have the editors of the given types drawn again."""
     for area in areas(*types):
         area.tag_redraw()
 
@@ -35,7 +35,7 @@ def redraw_sidebars() -> None:
 
 
 def draw_texts(texts: Iterable[tuple[str, float, float, tuple[float, ...]]], size: float) -> None:
-    """Write texts at places (x, y) of the region, in colours, over their shadows; all in pixels."""
+    """Write texts (text, x, y, colour) with shadows over a region; positions and font size in pixels."""
     blf.size(0, size)
     blf.enable(0, blf.SHADOW)
     blf.shadow(0, 5, 0.0, 0.0, 0.0, 1.0)
@@ -47,13 +47,13 @@ def draw_texts(texts: Iterable[tuple[str, float, float, tuple[float, ...]]], siz
 
 
 def text_width(text: str, size: float) -> float:
-    """How wide a text is that `draw_texts` writes, pixels."""
+    """Return the width, pixels, of a text that `draw_texts` writes."""
     blf.size(0, size)
     return float(blf.dimensions(0, text)[0])
 
 
 def draw_rectangle(frame: tuple[float, float, float, float], color: tuple[float, ...]) -> None:
-    """Fill the rectangle from left, bottom to right, top, in pixels of the region."""
+    """Fill a rectangle (left, bottom, right, top), pixels of the region."""
     left, bottom, right, top = frame
     shader = gpu.shader.from_builtin("UNIFORM_COLOR")
     shader.uniform_float("color", color)
@@ -64,7 +64,7 @@ def draw_rectangle(frame: tuple[float, float, float, float], color: tuple[float,
 
 
 def draw_lines(points: Any, color: tuple[float, ...], width: float, kind: str = "LINES") -> None:
-    """Draw lines `width` pixels wide through points (N, 3): by "LINES" two points each, by "LINE_STRIP" one through all."""
+    """Draw lines `width` pixels wide through points (N, 3): a line per two points for "LINES", one line for "LINE_STRIP"."""
     shader = gpu.shader.from_builtin("POLYLINE_UNIFORM_COLOR")
     shader.uniform_float("viewportSize", gpu.state.viewport_get()[2:])
     shader.uniform_float("lineWidth", width)

@@ -1,6 +1,7 @@
 """The whole command line: ``mphdrr`` as a program, and ``blender --command mphdrr`` in the application.
 
-The commands without Blender are in `core.cli`; those here import bpy only when they run.
+The commands without Blender are in `core.cli`; those here import bpy only when they run. `main` runs a command line. To add
+a command that needs Blender, write a module here with `add_parser`, and add its line to `COMMANDS`.
 """
 
 from collections.abc import Sequence
@@ -12,7 +13,7 @@ COMMANDS = {
     f"{__name__}.scene": "make a Blender scene of the scanner, with a volume and projections",
     f"{__name__}.demo": "run the main job: workbook, phantom, 80 projections, scene, pictures and dataset",
 }
-"""Those that need Blender."""
+"""Summaries of the commands that need Blender, by module."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -1,4 +1,4 @@
-"""``mphdrr demo``: the main job on the example workbook, from the geometry to a file to train on."""
+"""``mphdrr demo``: the main job on the example workbook, from the geometry to a dataset for training."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from typing import Any
 from ... import core as mph
 from ...core import files
 from ...core.cli.options import add_command, progress_bar
-from ...core.cli.scanners import add_workbook, read_workbook
+from ...core.cli.scanners import add_workbook, read_pinhole_system
 from ...core.errors import warn
 from ...core.example import EULER_DEGREES, EXAMPLE
 from ...core.runs.mosaic import write_sheet
@@ -21,15 +21,15 @@ from . import COMMANDS
 from .scene import INSTALL_BLENDER, new_scene, quiet, save_scene
 
 _FIGURES = {"phantom": "picture", "cut-away": "cut-away", "sums": "sums"}
-"""Name and kind of those besides the modules' ranges."""
+"""Kinds of the figures by name, besides those of the modules' ranges."""
 _SIZE = dict.fromkeys(("scanner", "picture", "cut-away"), (880, 510))
-"""Smaller than usual: they take most of the demo's time."""
+"""Sizes of figures, pixels; smaller than usual, since figures take most of the demo's time."""
 
 
 def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
     """Add the command."""
     parser = add_command(subparsers, "demo", COMMANDS[__name__], "mphdrr demo --output out")
-    parser.add_argument("--output", default="out", metavar="FOLDER", help="where the results go")
+    parser.add_argument("--output", default="out", metavar="FOLDER", help="folder for the results")
     add_workbook(parser, "--workbook", str(EXAMPLE))
     parser.add_argument("--voxels", type=int, default=256, metavar="N", help="voxels along each side of the volume")
     parser.add_argument("--size", type=int, default=256, metavar="N", help="pixels along each side of an image")
@@ -37,11 +37,12 @@ def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
 
 
 def _run(arguments: argparse.Namespace) -> None:
+    """Run the demo."""
     out = files.ensure_folder(arguments.output)
     has_blender = importlib.util.find_spec("bpy") is not None
-    scene = new_scene() if has_blender else None  # before the long work: what is wrong with Blender shows at once
+    scene = new_scene() if has_blender else None  # before the long work, so that problems with Blender show at once
     with _step("geometry"):
-        system = read_workbook(arguments)
+        system = read_pinhole_system(arguments)
     with _step("projections"):
         recipe = mph.Recipe({
             "system.file": arguments.workbook,
@@ -82,14 +83,15 @@ def _make_scene(scene: Any, run: mph.ProjectionRun, out: Path) -> None:
         save_scene(out / "scanner.blend")
     with _step("pictures"), quiet():
         ranges = (f"{first}-{last}" for first, last in scanner.quick_ranges(run.system))
-        wanted = [(f"modules-{modules}", "scanner", modules) for modules in ranges]
-        for name, figure, modules in (*wanted, *((name, kind, None) for name, kind in _FIGURES.items())):
+        range_figures = [(f"modules-{modules}", "scanner", modules) for modules in ranges]
+        for name, figure, modules in (*range_figures, *((name, kind, None) for name, kind in _FIGURES.items())):
             path = out / f"{name}.png"
             jobs.run(figures.figure_job(bpy.context, figure, [path], _SIZE.get(figure), modules, samples=8))
 
 
 @contextlib.contextmanager
 def _step(name: str) -> Iterator[None]:
+    """Print the name and the duration, s, of a step."""
     started = time.monotonic()
     yield
     print(f"{name:12s} {time.monotonic() - started:5.1f} s", flush=True)

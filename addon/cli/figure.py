@@ -1,4 +1,4 @@
-"""``mphdrr figure KIND FILE … -o PICTURE``; only the figures that are rendered, and a .blend, need Blender."""
+"""``mphdrr figure KIND FILE … -o PICTURE``; only rendered figures and .blend files need Blender."""
 
 from __future__ import annotations
 
@@ -42,16 +42,16 @@ def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
     )
     add = parser.add_argument
     add("kind", nargs="?", metavar="KIND", help=f"one of {', '.join(KINDS)}; --list explains them")
-    text = "what it is of: a workbook, a phantom (its kind or a .toml), a volume, a recipe, a run, or a .blend alone"
+    text = "subject of the figure: workbook, phantom (its kind or a .toml), volume, recipe, run, or a .blend alone"
     add("files", nargs="*", metavar="FILE", help=text)
     text = f"{', '.join(SUFFIXES)}, {', '.join(FILMS)} of animations; in .svg the labels are text; may be repeated"
     add("-o", "--output", action="append", default=[], metavar="FILE", help=text)
     add("--list", action="store_true", help="list the kinds of figures")
     add("--size", type=_size, metavar="WIDTHxHEIGHT", help="pixels; the kind's own by default")
-    text = "such as 1-40 or 1-20,41; default: all, but a picture's rays are of a ring, and c-arm shows the first"
+    text = "such as 1-40 or 1-20,41; default: all, but picture draws the rays of one ring, and c-arm shows the first"
     add("--modules", metavar="RANGE", help=text)
     add(
-        "--position", type=float, nargs=3, default=[0.0, 0.0, 0.0], metavar="MM", help="of a phantom: its middle, x y z"
+        "--position", type=float, nargs=3, default=[0.0, 0.0, 0.0], metavar="MM", help="of a phantom: its centre, x y z"
     )
     text = "of a phantom: phi theta psi, psi about its own axis, then theta about world y, then phi about world z"
     add("--euler-degrees", type=float, nargs=3, default=[0.0, 0.0, 0.0], metavar="DEG", help=text)
@@ -65,6 +65,7 @@ def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
 
 
 def _size(text: str) -> tuple[int, int]:
+    """Parse an image size such as 1600x900."""
     width, _, height = text.lower().partition("x")
     try:
         return int(width), int(height)
@@ -73,6 +74,7 @@ def _size(text: str) -> tuple[int, int]:
 
 
 def _run(arguments: argparse.Namespace) -> None:
+    """Draw or list figures."""
     if arguments.list:
         width = max(map(len, KINDS))
         print(
@@ -85,20 +87,20 @@ def _run(arguments: argparse.Namespace) -> None:
     if not arguments.output:
         raise mph.InputError("nothing to write: give --output FILE")
     paths = [output_path(name, kind.suffixes) for name in arguments.output]
-    how = Rendering(*(not arguments.no_labels, *(getattr(arguments, name) for name in Rendering._fields[1:])))
-    page = kind.page(arguments.size, how)
+    style = Rendering(*(not arguments.no_labels, *(getattr(arguments, name) for name in Rendering._fields[1:])))
+    page = kind.page(arguments.size, style)
     blends = [file for file in arguments.files if file.lower().endswith(".blend")]
     if blends:
         if len(arguments.files) > 1:
             raise mph.InputError(f"{blends[0]}: a .blend holds all that is shown; give no other file")
         refuse(arguments, _POSED, "is for phantoms that are named on the command line, not for a .blend")
-        _of_scene(arguments, kind, Path(blends[0]), paths, how)
+        _draw_scene(arguments, kind, Path(blends[0]), paths, style)
     else:
-        subject = _subject(arguments)
-        have = [need for need in NEEDS if getattr(subject, need) is not None]
-        require(kind.needs, have, kind.name, _MISSING)
+        subject = _read_subject(arguments)
+        available = [need for need in NEEDS if getattr(subject, need) is not None]
+        require(kind.needs, available, kind.name, _MISSING)
         if kind.draw is None:
-            _render(kind, page, subject, paths, how)
+            _render_figure(kind, page, subject, paths, style)
         else:
             kind.draw(page, subject)
             for path in paths:
@@ -107,8 +109,10 @@ def _run(arguments: argparse.Namespace) -> None:
         print(path)
 
 
-def _of_scene(arguments: argparse.Namespace, kind: FigureKind, blend: Path, paths: list[Path], how: Rendering) -> None:
-    """A figure of the scene in a .blend, as the window makes it."""
+def _draw_scene(
+    arguments: argparse.Namespace, kind: FigureKind, blend: Path, paths: list[Path], style: Rendering
+) -> None:
+    """Draw a figure of the scene in a .blend, as the window draws it."""
     new_scene()
     import bpy
 
@@ -119,12 +123,12 @@ def _of_scene(arguments: argparse.Namespace, kind: FigureKind, blend: Path, path
             bpy.ops.wm.open_mainfile(filepath=str(blend.absolute()))
         except RuntimeError as error:
             raise mph.InputError(f"{blend}: cannot be opened ({str(error).strip().splitlines()[0]})") from None
-        job = figures.figure_job(bpy.context, kind.name, paths, arguments.size, arguments.modules, **how._asdict())
-        _follow(job.finish(job.work(lambda done, total: None)))
+        job = figures.figure_job(bpy.context, kind.name, paths, arguments.size, arguments.modules, **style._asdict())
+        _run_steps(job.finish(job.work(lambda done, total: None)))
 
 
-def _render(kind: FigureKind, page: Page, subject: FigureSubject, paths: list[Path], how: Rendering) -> None:
-    """A figure that Blender renders."""
+def _render_figure(kind: FigureKind, page: Page, subject: FigureSubject, paths: list[Path], style: Rendering) -> None:
+    """Draw a figure that Blender renders."""
     new_scene()
     from ..figures import figures
     from ..volumes import volumes
@@ -134,66 +138,67 @@ def _render(kind: FigureKind, page: Page, subject: FigureSubject, paths: list[Pa
     if kind.studio.volume and subject.volume is not None:
         item = volumes.add_volume(subject.volume, subject.name or "Volume")
     with quiet():
-        _follow(figures.drawing(page, subject, kind, item, paths, how, figures.Reel()))
+        _run_steps(figures.draw_figure(page, subject, kind, item, paths, style, figures.Reel()))
 
 
-def _follow(steps: Any) -> None:
-    """Take the steps of a drawing, and show how far it is."""
-    show = progress_bar("rendering")
+def _run_steps(steps: Any) -> None:
+    """Take the steps of a drawing, and show its progress."""
+    report = progress_bar("rendering")
     for step in filter(None, steps):
-        show(*step[1:])
+        report(*step[1:])
 
 
-def _subject(arguments: argparse.Namespace) -> FigureSubject:
-    """What the files and names on the command line hold; of two that hold the same, the later counts."""
-    found: dict[str, Any] = {"modules": arguments.modules}
-    posed = False
+def _read_subject(arguments: argparse.Namespace) -> FigureSubject:
+    """Read all files of the command line into one `FigureSubject`; later files override earlier ones."""
+    values: dict[str, Any] = {"modules": arguments.modules}
+    is_posed = False
     for file in arguments.files:
-        made = _read(arguments, file, found.get("scanner"))
-        posed = posed or made.pop("posed", False)
-        found |= made
-    if not posed:
+        file_values = _read_file(arguments, file, values.get("scanner"))
+        is_posed = is_posed or file_values.pop("posed", False)
+        values |= file_values
+    if not is_posed:
         refuse(arguments, _POSED, "is for a phantom: name its kind, or its .toml")
-    return FigureSubject(**found)
+    return FigureSubject(**values)
 
 
-def _read(arguments: argparse.Namespace, file: str, scanner: Any) -> dict[str, Any]:
-    """What one of the files holds, by the names of `FigureSubject`'s fields."""
+def _read_file(arguments: argparse.Namespace, file: str, scanner: Any) -> dict[str, Any]:
+    """Return the values of `FigureSubject`'s fields that a file, or a kind of phantom, holds."""
     suffix = Path(file).suffix.lower()
     if suffix in _WORKBOOKS:
         return {"scanner": mph.read_scanner(file, next(iter(mph.kinds_in(file)), "pinhole"))}
     if suffix == ".toml" and "shape" not in read_toml(file):
         (run,) = mph.run_recipe(mph.read_recipe(file), scanner, stages=progress_bar)
-        return _of_run(run)
+        return _run_values(run)
     kinds = [kind for kind in PHANTOMS if kind.name == file]
     if kinds or suffix == ".toml":
         phantom: Any = kinds[0].phantom(**kinds[0].usual) if kinds else mph.read_phantom(file)
         phi, theta, psi = np.deg2rad(arguments.euler_degrees)
         pose = mph.euler_pose(phi, theta, psi, arguments.position)
-        # As large as the phantom however it is turned, and a voxel free all around.
+        # The grid holds the phantom in any rotation, with a margin of one voxel.
         spacing = phantom.extent / max(1, arguments.voxels - 2)
         grid = mph.Grid.centered(arguments.voxels, spacing, arguments.position)
         volume = phantom.voxelize(grid, pose, progress_bar("voxelizing"))
         return {"volume": volume, "pose": pose, "name": phantom.title, "posed": True}
     if suffix in FORMATS:
         try:
-            return _of_run(mph.read_run(file))
+            return _run_values(mph.read_run(file))
         except mph.InputError:
             if suffix == ".pt" or not Path(file).is_file():
                 raise
     return {"volume": mph.read_volume(file), "pose": None, "name": Path(file).name}
 
 
-def _of_run(run: mph.ProjectionRun) -> dict[str, Any]:
-    found: dict[str, Any] = {
+def _run_values(run: mph.ProjectionRun) -> dict[str, Any]:
+    """Return the values of `FigureSubject`'s fields that a run holds."""
+    values: dict[str, Any] = {
         "scanner": run.system,
         "volume": run.volume,
         "run": run,
         "name": str(run.settings.get("volume", "")),
     }
-    with contextlib.suppress(mph.InputError):  # of version 0.1.0, which keeps no recipe
+    with contextlib.suppress(mph.InputError):  # runs of version 0.1.0 have no recipe
         if any(key.startswith("phantom.") for key in run.recipe.given):
             from ...core.runs.run_recipe import phantom_pose
 
-            found["pose"] = phantom_pose(run.recipe)
-    return {"pose": None, **found}
+            values["pose"] = phantom_pose(run.recipe)
+    return {"pose": None, **values}

@@ -1,4 +1,4 @@
-"""``mphdrr scene WORKBOOK -o FILE.blend``, and the Blender session that commands work in."""
+"""``mphdrr scene WORKBOOK -o FILE.blend``, and the Blender session in which commands work."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from typing import TYPE_CHECKING
 
 from ... import core as mph
 from ...core.cli.options import add_command, output_path
-from ...core.cli.scanners import add_workbook, chosen_modules, read_any
+from ...core.cli.scanners import add_workbook, chosen_modules, read_any_scanner
 from . import COMMANDS
 
 if TYPE_CHECKING:
     import bpy
 
-# Double quotes: Windows' command prompt knows no others.
+# Double quotes, because Windows' command prompt knows no others.
 INSTALL_BLENDER = 'pip install "mphdrr[blender]", or ".[blender]" in its source; or run blender --command mphdrr'
 
 
@@ -38,10 +38,11 @@ def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
 
 
 def _run(arguments: argparse.Namespace) -> None:
+    """Write the .blend."""
     from ...core.volumes.volume_files import read_volume_of
 
     path = output_path(arguments.output, (".blend",))
-    system = chosen_modules(read_any(arguments), arguments.modules)
+    system = chosen_modules(read_any_scanner(arguments), arguments.modules)
     volume = mph.read_volume(arguments.volume) if arguments.volume else None
     mu = read_volume_of(arguments.mu, "mu") if arguments.mu else None
     run = mph.read_run(arguments.run_file) if arguments.run_file else None
@@ -66,7 +67,7 @@ def _run(arguments: argparse.Namespace) -> None:
 
 
 def new_scene() -> bpy.types.Scene:
-    """An empty scene in an empty file, with the extension registered; raises `InputError` where there is no Blender."""
+    """Return an empty scene in an empty file, with the extension registered; raise `InputError` where Blender is missing."""
     try:
         import bpy
     except ModuleNotFoundError:
@@ -89,21 +90,21 @@ def new_scene() -> bpy.types.Scene:
 
 @contextlib.contextmanager
 def quiet() -> Iterator[None]:
-    """Keep what Blender itself prints on standard output, a line for every tile and file, out of sight."""
+    """Hide what Blender itself prints on standard output: a line for every tile and file."""
     sys.stdout.flush()
-    kept = os.dup(1)
-    nowhere = os.open(os.devnull, os.O_WRONLY)
+    stdout_copy = os.dup(1)
+    null = os.open(os.devnull, os.O_WRONLY)
     try:
-        os.dup2(nowhere, 1)
+        os.dup2(null, 1)
         yield
     finally:
-        os.dup2(kept, 1)
-        os.close(kept)
-        os.close(nowhere)
+        os.dup2(stdout_copy, 1)
+        os.close(stdout_copy)
+        os.close(null)
 
 
 _BLEND_END, _PACKED_END = 64, b"\xb1\xea\x92\x8f"
-"""In how many bytes a .blend says that it ends there, with ENDB, or if it is compressed with Zstandard's table."""
+"""Number of last bytes in which a .blend has "ENDB", and the bytes that end a compressed .blend (Zstandard's table)."""
 
 
 def save_scene(path: Path) -> None:
@@ -111,7 +112,7 @@ def save_scene(path: Path) -> None:
     import bpy
 
     try:
-        # No .blend1 beside the result of a command.
+        # Prevents a .blend1 beside the result of a command.
         bpy.context.preferences.filepaths.save_version = 0
         with quiet():
             bpy.ops.wm.save_as_mainfile(filepath=os.path.abspath(path), check_existing=False)
@@ -121,5 +122,5 @@ def save_scene(path: Path) -> None:
         file.seek(max(0, path.stat().st_size - _BLEND_END))
         end = file.read()
     if not end.endswith(_PACKED_END) and b"ENDB" not in end:
-        path.unlink()  # Blender 5.2 says of what it has cut that it was saved
+        path.unlink()  # Blender 5.2 reports an incomplete file as saved
         raise mph.InputError(f"{path}: cannot be written (Blender left it incomplete: is the disk full?)")

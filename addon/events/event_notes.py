@@ -1,4 +1,4 @@
-"""What the Event Set panel says of a recipe and of a set: read by threads, so that no file keeps the window waiting."""
+"""Notes of the Event Set panel on a recipe and a set, read by threads, so that no file keeps the window waiting."""
 
 import contextlib
 import functools
@@ -14,55 +14,55 @@ import numpy as np
 
 from ...core import InputError, events, recording
 from ...core.events.folders import INDEX, RECIPE, SetFolder
-from ...core.events.store import EVENTS, SHARDS, size_of
+from ...core.events.store import EVENTS, SHARDS, file_size
 from ...core.memory import readable_size
 from ..blender import reports, storage, timers, windows
 
-_INTERVAL = 0.1  # s between two looks at a thread that reads
-_LOOK = 2.0  # s between two looks at a file's date
+_CHECK_INTERVAL = 0.1  # s between two checks of a reading thread
+_STAMP_LIFETIME = 2.0  # s for which a file's date, once read, is used
 
 
 @dataclass(frozen=True)
 class Note:
-    """One line about a recipe or a set, and the names of its models."""
+    """A line about a recipe or a set, and the names of its models."""
 
     text: str
     is_wrong: bool = False
     models: tuple[str, ...] = ()
 
 
-_Stamp = tuple[Any, ...]  # by which a file that has changed is read again
+_Stamp = tuple[Any, ...]  # dates and sizes of files; a changed stamp lets a file be read again
 _UNKNOWN: tuple[_Stamp | None, Note] = None, Note("Reading …")
-_known: dict[Path, tuple[_Stamp, Note]] = {}
-_readers: dict[Path, threading.Thread] = {}
+_notes: dict[Path, tuple[_Stamp, Note]] = {}
+_threads: dict[Path, threading.Thread] = {}
 
 
-def of_recipe(filepath: str) -> Note | None:
-    """What a recipe is, or what is wrong with it; None where no file is given."""
-    return _note(storage.absolute(filepath), _recipe_note) if filepath else None
+def recipe_note(filepath: str) -> Note | None:
+    """Return a note on a recipe's content, or on its error; None where no file is given."""
+    return _note(storage.absolute(filepath), _read_recipe) if filepath else None
 
 
-def of_set(folder: str) -> Note | None:
-    """What is in a set's folder; None where there is no set yet."""
+def set_note(folder: str) -> Note | None:
+    """Return a note on a set's content; None where there is no set yet."""
     if not folder or not (storage.absolute(folder) / RECIPE).is_file():
         return None
-    return _note(storage.absolute(folder), _set_note)
+    return _note(storage.absolute(folder), _read_set)
 
 
 def models(folder: str) -> tuple[str, ...]:
-    """Names of the models that a set's events have projections of."""
-    note = of_set(folder)
+    """Return the names of the models of which a set's events have projections."""
+    note = set_note(folder)
     return () if note is None else note.models
 
 
 def stop() -> None:
-    """Forget everything: the extension is disabled."""
-    _known.clear()
-    _readers.clear()
+    """Forget all notes when the extension is disabled."""
+    _notes.clear()
+    _threads.clear()
 
 
-def _recipe_note(path: Path) -> Note:
-    """Phantoms, models and voxels; `InputError` also where a file that the recipe names is missing."""
+def _read_recipe(path: Path) -> Note:
+    """Return a note on phantoms, models and voxels; raise `InputError` also where a file named in the recipe is missing."""
     recipe = events.read_recipe(path)
     for name in recipe.files:
         recipe.input(name)
@@ -75,59 +75,61 @@ def _recipe_note(path: Path) -> Note:
     return Note(f"{'; '.join(names)}; {voxels} voxels of {sides} mm")
 
 
-def _set_note(path: Path) -> Note:
-    """How many events there are, and how large they are."""
+def _read_set(path: Path) -> Note:
+    """Return a note on the number and the size of a set's events."""
     folder = SetFolder(path)
-    places, models = folder.store.places(), tuple(folder.recipe.models)
-    size = sum(map(size_of, places.values()))
-    return Note(f"{len(places)} of {sum(map(len, folder.asked))} events, {readable_size(size)}", models=models)
+    locations, models = folder.store.locations(), tuple(folder.recipe.models)
+    size = sum(map(file_size, locations.values()))
+    return Note(f"{len(locations)} of {sum(map(len, folder.requested))} events, {readable_size(size)}", models=models)
 
 
 def _note(path: Path, read: Callable[[Path], Note]) -> Note:
-    """The note on a file or folder as it is now; in a window, what was known before while a thread reads it."""
+    """Return the note on a file or folder as it is now; in a window, the previous note while a thread reads the file."""
     stamp = _stamp(path)
-    if bpy.app.background and _known.get(path, _UNKNOWN)[0] != stamp:
+    if bpy.app.background and _notes.get(path, _UNKNOWN)[0] != stamp:
         _read(path, stamp, read)
-    known, note = _known.get(path, _UNKNOWN)
-    if known != stamp and path not in _readers:
-        _readers[path] = threading.Thread(target=_read, args=(path, stamp, read), name="mphDRR: reading", daemon=True)
-        _readers[path].start()
-        timers.soon(_watch, _INTERVAL)
+    old_stamp, note = _notes.get(path, _UNKNOWN)
+    if old_stamp != stamp and path not in _threads:
+        _threads[path] = threading.Thread(target=_read, args=(path, stamp, read), name="mphDRR: reading", daemon=True)
+        _threads[path].start()
+        timers.schedule(_check_threads, _CHECK_INTERVAL)
     return note
 
 
 def _read(path: Path, stamp: _Stamp, read: Callable[[Path], Note]) -> None:
+    """Read a file and store its note, which may be an error."""
     try:
         with recording.recorded_warnings():
             note = read(path)
     except InputError as error:
         note = Note(reports.in_window(error).removeprefix(f"{path}: "), is_wrong=True)
-    except Exception as error:  # such as a file that is being written
+    except Exception as error:  # for example while the file is being written
         note = Note(f"{path.name}: cannot be read ({type(error).__name__}: {error})", is_wrong=True)
-    _known[path] = stamp, note
+    _notes[path] = stamp, note
 
 
 def _stamp(path: Path) -> _Stamp:
-    """The dates of a file or folder and of what lies in it. Panels are drawn often: looks at the disk are 2 s apart."""
+    """Return the stamp of a file or folder and its content; the disk is asked every two seconds at most."""
     now = time.monotonic()
-    return _stamp_at(path, now if bpy.app.background else now // _LOOK)
+    return _cached_stamp(path, now if bpy.app.background else now // _STAMP_LIFETIME)
 
 
 @functools.lru_cache(maxsize=64)
-def _stamp_at(path: Path, now: float) -> _Stamp:
-    found = []
+def _cached_stamp(path: Path, interval: float) -> _Stamp:
+    """Return a stamp; `interval`, the number of the present two seconds, lets the cache forget older stamps."""
+    stamp = []
     for item in (path, path / RECIPE, path / INDEX, path / EVENTS, path / SHARDS):
         with contextlib.suppress(OSError):
             state = item.stat()
-            found.append((state.st_mtime_ns, state.st_size))
-    return tuple(found)
+            stamp.append((state.st_mtime_ns, state.st_size))
+    return tuple(stamp)
 
 
-def _watch() -> float | None:
-    """Have the sidebars drawn where a thread has read."""
-    done = [path for path, reader in _readers.items() if not reader.is_alive()]
-    for path in done:
-        del _readers[path]
-    if done:
+def _check_threads() -> float | None:
+    """Have the sidebars drawn again when a thread has finished."""
+    finished = [path for path, reader in _threads.items() if not reader.is_alive()]
+    for path in finished:
+        del _threads[path]
+    if finished:
         windows.redraw_sidebars()
-    return _INTERVAL if _readers else None
+    return _CHECK_INTERVAL if _threads else None

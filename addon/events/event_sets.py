@@ -25,227 +25,234 @@ from ..runs import rendering, runs
 from ..scanner import scanner
 from ..volumes import stored_volumes, volumes
 
-_VOXELS = 128
-"""Along each side of a phantom, at most, unless the phantom in the scene says another number."""
+_MAX_VOXELS = 128
+"""Largest number of voxels along each side of a phantom, unless the phantom in the scene has another number."""
 
 
 @dataclass(frozen=True)
 class _Target:
-    """The phantom in the scene that becomes that of an event, for a thread that leaves bpy alone."""
+    """Phantom in the scene that will become an event's phantom, described for a worker thread."""
 
-    uid: int = 0  # 0: there is none yet
-    others: tuple[str, ...] = ()  # quantities of its other volumes
-    voxels: int = 0  # along each side; 0: as the recipe says
+    uid: int = 0  # `session_uid` of its object; 0: there is none yet
+    other_quantities: tuple[str, ...] = ()  # quantities of its other volumes
+    voxels: int = 0  # number along each side; 0: the recipe's
 
 
 @dataclass(frozen=True)
 class _Phantom:
-    """An event's phantom, its voxels stored."""
+    """An event's phantom with its voxels in files."""
 
     stored: list[stored_volumes.StoredVolume]
-    settings: phantom_properties.KindSettings | None  # None: of no kind, but a file's
-    placement: NDArray[np.float64]  # world from object
+    settings: phantom_properties.KindSettings | None  # None for a phantom from a file
+    placement: NDArray[np.float64]  # world from object (4, 4), mm
 
 
-def write_recipe(scene: bpy.types.Scene, filepath: str, like: str) -> str:
-    """Write a recipe like one of `TEMPLATES`, of the scene's workbook or else the example's, and choose it in the panel."""
+def write_recipe(scene: bpy.types.Scene, filepath: str, template: str) -> str:
+    """Write a recipe from one of `TEMPLATES`, with the scene's or the example's workbook, and choose it in the panel."""
     if not filepath:
         raise InputError("no file given: set filepath to a name ending in .toml")
     path = storage.absolute(filepath)
     collection = scanner.active_scanner(scene)
-    known = collection.mphdrr_scanner.workbook if collection is not None else ""
-    workbook = storage.absolute(known) if known else EXAMPLE
+    scanner_workbook = collection.mphdrr_scanner.workbook if collection is not None else ""
+    workbook = storage.absolute(scanner_workbook) if scanner_workbook else EXAMPLE
     is_near = workbook.is_relative_to(path.parent)
-    text = template_text(like, workbook.relative_to(path.parent).as_posix() if is_near else workbook)
+    text = template_text(template, workbook.relative_to(path.parent).as_posix() if is_near else workbook)
     write_bytes(path, text.encode())
     scene.mphdrr_events.recipe = storage.stored_path(path)
     return f"Wrote {path}, of {workbook.name}: edit it in any editor of text"
 
 
-def trying(context: bpy.types.Context, filepath: str, number: int, folder: str = "") -> jobs.Job:
-    """The job that makes the phantom in the scene that of event `number` of a recipe, and counts the panel's number up.
+def try_event_job(context: bpy.types.Context, filepath: str, number: int, folder: str = "") -> jobs.Job:
+    """Return the job that makes the scene's phantom that of event `number` of a recipe, and increases the panel's number.
 
-    Without a recipe's file it is the recipe of the set in `folder`. The phantom is the active one, else that which was tried
+    Without a recipe's file it takes the recipe of the set in `folder`. The phantom is the active one, else the one tried
     last, else the scene's only one, else a new one. Its object is placed with the event's mirroring and size; a factor of
-    activity is in its settings. Raises InputError.
+    activity enters its settings. Raises InputError.
     """
-    read, scene, files = _reading(filepath, folder), context.scene, storage.folder()
-    target, uid = _target_of(_phantom_to_try(context)), scene.session_uid
+    read, scene, files = _recipe_reader(filepath, folder), context.scene, storage.folder()
+    target, uid = _make_target(_phantom_to_try(context)), scene.session_uid
 
     def work(progress: Progress) -> tuple[_Phantom, str]:
         planned = events.plan(read(), number)
-        return _phantom_of(planned, target, files, progress), _text(planned)
+        return _store_phantom(planned, target, files, progress), _describe(planned)
 
-    def finish(made: tuple[_Phantom, str]) -> str:
-        phantom, text = made
-        scene = jobs.scene_again(uid, "the event is")
+    def finish(result: tuple[_Phantom, str]) -> str:
+        phantom, text = result
+        scene = jobs.require_scene(uid, "the event is")
         settings = scene.mphdrr_events
-        item = _put(scene, phantom, target)
+        item = _place_phantom(scene, phantom, target)
         settings.phantom, settings.tried, settings.number = item, text, number + 1
-        _show(item, settings.truth)
+        _select(item, settings.truth)
         return f"{item.name!r} is now the phantom of {text}"
 
     return jobs.Job("Trying an event", work, finish)
 
 
-def making(filepath: str, folder: str, count: int) -> jobs.Job:
-    """The job that makes the first `count` events of a recipe in a set's folder, those that are not there yet.
+def make_set_job(filepath: str, folder: str, count: int) -> jobs.Job:
+    """Return the job that makes the first `count` events of a recipe in a set's folder, except those that it has already.
 
-    Without a recipe's file it is the folder's own. What is made stays, also where the user cancels. Raises InputError.
+    Without a recipe's file it takes the folder's own recipe. Events made before the user cancels stay. Raises InputError.
     """
     if not folder:
         raise InputError("no folder given: choose a new one for the event set, or that of a set to go on with")
-    read, path = _reading(filepath, folder), storage.absolute(folder)
-    made: list[events.Made] = []
+    read, path = _recipe_reader(filepath, folder), storage.absolute(folder)
+    new_events: list[events.Made] = []
 
     def work(progress: Progress) -> float:
         start = time.perf_counter()
-        within = stages_of(progress)("making events") or progress
+        report = stages_of(progress)("making events") or progress
 
         def step(done: int, steps: int) -> None:
-            """Between the steps of an event: says how many events are done, and stops where the user wants that."""
-            within(len(made), made[-1].total if made else 0)
+            """Report the number of finished events between the steps of an event, and stop where the user has cancelled."""
+            report(len(new_events), new_events[-1].total if new_events else 0)
 
         for event in events.making(read(), path, count, progress=step):
-            made.append(event)
+            new_events.append(event)
             step(0, 0)
         return time.perf_counter() - start
 
     def finish(seconds: float) -> str:
-        there = len(SetFolder(path).store.places())
-        if not made:
-            return f"All events asked for are there already: {there} in {path}"
-        size = memory.readable_size(sum(event.size for event in made))
-        return f"Made {_events(len(made))}, {size} in {seconds:.1f} s: {there} in {path}"
+        n_events = len(SetFolder(path).store.locations())
+        if not new_events:
+            return f"All events asked for are there already: {n_events} in {path}"
+        size = memory.readable_size(sum(event.size for event in new_events))
+        return f"Made {_events_text(len(new_events))}, {size} in {seconds:.1f} s: {n_events} in {path}"
 
-    def left() -> str:
-        return f"{_events(len(made))} made now and kept; Make Event Set goes on from there"
+    def leftovers() -> str:
+        return f"{_events_text(len(new_events))} made now and kept; Make Event Set goes on from there"
 
-    return jobs.Job("Making an event set", work, finish, left=left)
+    return jobs.Job("Making an event set", work, finish, leftovers=leftovers)
 
 
 @dataclass(frozen=True)
-class _Opened:
-    """An event, ready to be put into the scene."""
+class _StoredEvent:
+    """An event with its voxels in files, ready to be put into the scene."""
 
     name: str
     text: str
     truth: stored_volumes.StoredVolume
-    phantom: _Phantom | None  # of one that a volume's file describes: the truth is all there is
+    phantom: _Phantom | None  # None for an event made from a volume's file, which has only the truth
     run: ProjectionRun | None
     pictures: images.Pictures | None
 
 
-def opening(context: bpy.types.Context, folder: str, number: int, model: str = "") -> jobs.Job:
-    """The job that puts an event of the set in a folder into the scene, in place of the one that was opened before.
+def open_event_job(context: bpy.types.Context, folder: str, number: int, model: str = "") -> jobs.Job:
+    """Return the job that puts an event of the set in a folder into the scene, in place of the one opened before.
 
-    Its truth is a volume, whose object has the event's pose; its phantom is hidden, and the projections of a model, by
-    default the first, are a run, of the set's scanner where the scene has none. Raises InputError.
+    Its truth is a volume whose object has the event's pose; its phantom is hidden. The projections of a model, by default
+    the first, become a run, of the set's scanner where the scene has none. Raises InputError.
     """
     if not folder:
         raise InputError("no folder given: choose that of an event set")
     scene, path, files = context.scene, storage.absolute(folder), storage.folder()
-    target, truth_uid = _target_of(_own(scene, "phantom")), getattr(_own(scene, "truth"), "session_uid", 0)
-    run_file, display, uid = rendering.run_path(scene), scene.mphdrr_display.display(), scene.session_uid
+    target, truth_uid = _make_target(_item(scene, "phantom")), getattr(_item(scene, "truth"), "session_uid", 0)
+    run_file, display, uid = rendering.new_run_path(scene), scene.mphdrr_display.display(), scene.session_uid
 
-    def work(progress: Progress) -> _Opened:
+    def work(progress: Progress) -> _StoredEvent:
         stages = stages_of(progress)
         stages("reading the event")
-        event = _event(path, number)
+        event = _read_event(path, number)
         name, planned = f"Event {number} {event.name}", event.planned
         stages("writing the voxels")
         truth = stored_volumes.store_volume(event.truth, files, event.placement, {"event": number, "set": str(path)})
-        phantom = None if planned.entry.kind is None else _phantom_of(planned, target, files, progress)
+        phantom = None if planned.entry.kind is None else _store_phantom(planned, target, files, progress)
         models = planned.recipe.models
         if not models:
-            return _Opened(name, _text(planned), truth, phantom, None, None)
+            return _StoredEvent(name, _describe(planned), truth, phantom, None, None)
         run = event.run(model or next(iter(models)))
         run = replace(run, settings={**run.settings, "volume": name})
-        return _Opened(name, _text(planned), truth, phantom, run, rendering.kept(run, run_file, display, stages))
+        pictures = rendering.write_and_draw(run, run_file, display, stages)
+        return _StoredEvent(name, _describe(planned), truth, phantom, run, pictures)
 
-    def finish(opened: _Opened) -> jobs.Finishing:
-        run, mosaic = opened.run, None
-        if run is not None and opened.pictures is not None:
-            mosaic = yield from images.storing(run, opened.pictures)
-        scene = jobs.scene_again(uid, "the event is")
+    def finish(stored_event: _StoredEvent) -> jobs.Finishing:
+        run, mosaic = stored_event.run, None
+        if run is not None and stored_event.pictures is not None:
+            mosaic = yield from images.store_images(run, stored_event.pictures)
+        scene = jobs.require_scene(uid, "the event is")
         settings = scene.mphdrr_events
         collection = scanner.active_scanner(scene)
         if run is not None and collection is None:
             collection = scanner.build_scanner(scene, run.system)
             studio.light(scene)
             yield None
-        if opened.phantom is not None:
-            settings.phantom = _put(scene, opened.phantom, target)
+        if stored_event.phantom is not None:
+            settings.phantom = _place_phantom(scene, stored_event.phantom, target)
             yield None
-        item = jobs.found_again(bpy.data.objects, truth_uid)
+        item = jobs.find_by_uid(bpy.data.objects, truth_uid)
         if item is None:
-            item = volumes.add_stored(opened.truth, opened.name, scene.collection)
+            item = volumes.add_stored(stored_event.truth, stored_event.name, scene.collection)
         else:
-            volumes.replace_stored(item, opened.truth)
-            item.name = opened.name
-        settings.truth, settings.tried = item, opened.text
-        _show(item, settings.phantom)
+            volumes.replace_stored(item, stored_event.truth)
+            item.name = stored_event.name
+        settings.truth, settings.tried = item, stored_event.text
+        _select(item, settings.phantom)
         yield None
         if run is not None:
-            rendering.place(scene, run, collection)
-            runs.add(scene, run, run_file, rendering.taken_over(scene, run, item), collection)
+            rendering.show_planes(scene, run, collection)
+            runs.add_run(scene, run, run_file, rendering.adopt_settings(scene, run, item), collection)
             images.show_below(mosaic, bpy.context)
-        return f"Opened {opened.text}" + ("" if run is not None else "; it has no projections of a model")
+        return f"Opened {stored_event.text}" + ("" if run is not None else "; it has no projections of a model")
 
     return jobs.Job("Opening an event", work, finish, lambda: run_file.unlink(missing_ok=True))
 
 
-def _reading(filepath: str, folder: str) -> Callable[[], events.EventRecipe]:
-    """What reads a recipe's file, or else the recipe of a set, in a thread; `InputError` where neither is given."""
+def _recipe_reader(filepath: str, folder: str) -> Callable[[], events.EventRecipe]:
+    """Return a function, for a worker thread, that reads the recipe file, or the recipe stored in the set.
+
+    `InputError` where neither is given.
+    """
     if filepath:
         path = storage.absolute(filepath)
         return lambda: events.read_recipe(path)
     if folder and SetFolder(storage.absolute(folder)).recipe_path.is_file():
-        found = SetFolder(storage.absolute(folder))
-        return lambda: found.recipe
+        set_folder = SetFolder(storage.absolute(folder))
+        return lambda: set_folder.recipe
     raise InputError("no recipe given: choose one, or write one with New Recipe")
 
 
-def _event(path: Path, number: int) -> events.Event:
-    found = events.EventSet(path)
-    event = next((event for event in found if event.number == number), None)
+def _read_event(path: Path, number: int) -> events.Event:
+    """Return an event of a set; raise `InputError` where the set lacks it."""
+    event_set = events.EventSet(path)
+    event = next((event for event in event_set if event.number == number), None)
     if event is None:
-        there = f"{_events(len(found))}, {found.numbers[0]} to {found.numbers[-1]}" if len(found) else "no events"
-        raise InputError(f"event {number}: not in {path}, which holds {there}")
+        numbers = event_set.numbers
+        content = f"{_events_text(len(numbers))}, {numbers[0]} to {numbers[-1]}" if len(numbers) else "no events"
+        raise InputError(f"event {number}: not in {path}, which holds {content}")
     return event
 
 
-def _phantom_of(planned: events.PlannedEvent, target: _Target, files: Path, progress: Progress) -> _Phantom:
-    """The phantom of an event with its own voxels, or, of one that is of no kind, the truth; leaves bpy alone."""
+def _store_phantom(planned: events.PlannedEvent, target: _Target, files: Path, progress: Progress) -> _Phantom:
+    """Store the phantom of an event with its own voxels or, for a phantom of no kind, the truth; free of bpy."""
     entry, recipe, phantom, placement = planned.entry, planned.recipe, planned.phantom, planned.placement
     if entry.kind is None or phantom is None:
         stages_of(progress)("voxelizing")
         truth = events.EventMaker(recipe).truth(planned)
         return _Phantom([stored_volumes.store_volume(truth, files, placement, planned.all_settings)], None, placement)
     values: dict[str, Any] = {}
-    known: tuple[Any, ...] = fields(phantom)  # type: ignore[arg-type]
-    for field in known:
+    phantom_fields: tuple[Any, ...] = fields(phantom)  # type: ignore[arg-type]
+    for field in phantom_fields:
         if field.metadata:
             is_activity = field.metadata.get("unit", "").startswith("kBq")
-            values[field.name] = _times(getattr(phantom, field.name), planned.activity_factor if is_activity else 1.0)
+            values[field.name] = _scaled(getattr(phantom, field.name), planned.activity_factor if is_activity else 1.0)
     if entry["gates"] > 1:
         values["frames"] = entry["gates"]
-    voxels = target.voxels or min(_VOXELS, *recipe.grid.shape)
+    voxels = target.voxels or min(_MAX_VOXELS, *recipe.grid.shape)
     settings = phantom_properties.plain_settings(entry.kind.name, **values, quantity=recipe.quantity, voxels=voxels)
-    quantities = [recipe.quantity, *target.others]
-    made = phantoms.recipe_of(settings).voxelize(quantities, [placement] * len(quantities), files, progress)
-    return _Phantom(made, settings, placement)
+    quantities = [recipe.quantity, *target.other_quantities]
+    stored = phantoms.copy_settings(settings).voxelize(quantities, [placement] * len(quantities), files, progress)
+    return _Phantom(stored, settings, placement)
 
 
-def _times(value: Any, factor: float) -> Any:
+def _scaled(value: Any, factor: float) -> Any:
+    """Return a setting's value, or tuple of values, times a factor."""
     if factor == 1.0:
         return value
     return tuple(factor * number for number in value) if isinstance(value, tuple) else factor * value
 
 
-def _put(scene: bpy.types.Scene, phantom: _Phantom, target: _Target) -> bpy.types.Object:
-    """Give the phantom in the scene an event's settings, voxels and place; a new one where there is none any more."""
-    item = jobs.found_again(bpy.data.objects, target.uid)
+def _place_phantom(scene: bpy.types.Scene, phantom: _Phantom, target: _Target) -> bpy.types.Object:
+    """Give the scene's phantom an event's settings, voxels and pose, and return its object; add a new one if it is gone."""
+    item = jobs.find_by_uid(bpy.data.objects, target.uid)
     if item is None:
         item = volumes.add_stored(phantom.stored[0], "Event Phantom", scene.collection)
     if phantom.settings is None:
@@ -253,58 +260,60 @@ def _put(scene: bpy.types.Scene, phantom: _Phantom, target: _Target) -> bpy.type
         phantoms.remove_outline(item)
         item.mphdrr_volume.kind = "VOLUME"
         return item
-    phantoms.take_settings(item, phantom.settings.identifier, phantom.settings.values())
+    phantoms.store_settings(item, phantom.settings.identifier, phantom.settings.values())
     item.matrix_world = Matrix(phantom.placement)
-    phantoms.replace(item, phantom.stored[: len(phantoms.with_children(item))])
+    phantoms.replace_voxels(item, phantom.stored[: len(phantoms.with_children(item))])
     return item
 
 
 def _phantom_to_try(context: bpy.types.Context) -> bpy.types.Object | None:
-    """The phantom of the scene that is meant; None where a new one is to be made."""
-    known = [item for item in volumes.volume_objects(context.scene) if phantoms.settings_of(item) is not None]
-    own = _own(context.scene, "phantom")
-    if context.object in known:
+    """Return the scene's phantom to try an event on; None where a new one is to be made."""
+    scene_phantoms = [item for item in volumes.volume_objects(context.scene) if phantoms.settings_of(item) is not None]
+    panel_phantom = _item(context.scene, "phantom")
+    if context.object in scene_phantoms:
         return context.object
-    return own or (known[0] if len(known) == 1 else None)
+    return panel_phantom or (scene_phantoms[0] if len(scene_phantoms) == 1 else None)
 
 
-def _own(scene: bpy.types.Scene, name: str) -> bpy.types.Object | None:
-    """The object that the panel's settings point to, unless the user has deleted it: Blender keeps it there."""
+def _item(scene: bpy.types.Scene, name: str) -> bpy.types.Object | None:
+    """Return an object that the panel's settings refer to; None if the user has deleted it."""
     item = getattr(scene.mphdrr_events, name)
     return item if item in volumes.volume_objects(scene) else None
 
 
-def _target_of(item: bpy.types.Object | None) -> _Target:
+def _make_target(item: bpy.types.Object | None) -> _Target:
+    """Return the target that an object of the scene, or None, describes."""
     if item is None:
         return _Target()
     settings = phantoms.settings_of(item)
-    others = tuple(volumes.quantity_of(child) for child in phantoms.with_children(item)[1:])
-    return _Target(item.session_uid, others, 0 if settings is None else settings.voxels)
+    other_quantities = tuple(volumes.quantity_of(child) for child in phantoms.with_children(item)[1:])
+    return _Target(item.session_uid, other_quantities, 0 if settings is None else settings.voxels)
 
 
-def _show(item: bpy.types.Object, other: bpy.types.Object | None) -> None:
-    """Select a volume, and hide the other one, which is at the same place."""
-    bpy.context.view_layer.update()  # or it does not know new objects
-    known = bpy.context.view_layer.objects
-    if other is not None and other != item and other.name in known:
-        other.hide_set(True)
-    if item.name in known:
+def _select(item: bpy.types.Object, hidden_item: bpy.types.Object | None) -> None:
+    """Select a volume, and hide another one at the same place."""
+    bpy.context.view_layer.update()  # makes it include new objects
+    layer_objects = bpy.context.view_layer.objects
+    if hidden_item is not None and hidden_item != item and hidden_item.name in layer_objects:
+        hidden_item.hide_set(True)
+    if item.name in layer_objects:
         item.hide_set(False)
         volumes.make_active(bpy.context, item)
 
 
-def _text(planned: events.PlannedEvent) -> str:
-    """What an event is, in a line."""
-    parts = [f"event {planned.number}: {planned.name}", *([planned.split] if planned.split else [])]
+def _describe(planned: events.PlannedEvent) -> str:
+    """Return an event's number, phantom, pose and factors in a line."""
+    words = [f"event {planned.number}: {planned.name}", *([planned.split] if planned.split else [])]
     if any(planned.position):
-        parts.append("at {:.4g} {:.4g} {:.4g} mm".format(*planned.position))
+        words.append("at {:.4g} {:.4g} {:.4g} mm".format(*planned.position))
     if any(planned.euler_degrees):
-        parts.append("turned by {:.4g} {:.4g} {:.4g}°".format(*planned.euler_degrees))
-    parts += ["mirrored"] if planned.mirror else []
+        words.append("turned by {:.4g} {:.4g} {:.4g}°".format(*planned.euler_degrees))
+    words += ["mirrored"] if planned.mirror else []
     for name, factor in (("size", planned.size), ("activity", planned.activity_factor)):
-        parts += [f"{name} × {factor:.3g}"] if factor != 1.0 else []
-    return ", ".join(parts)
+        words += [f"{name} × {factor:.3g}"] if factor != 1.0 else []
+    return ", ".join(words)
 
 
-def _events(count: int) -> str:
+def _events_text(count: int) -> str:
+    """Return a number of events in words."""
     return f"{count} event{'s' * (count != 1)}"

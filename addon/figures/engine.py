@@ -1,4 +1,4 @@
-"""Blender as an engine: scenes rendered by Cycles to pictures, and pictures put together to films."""
+"""Blender as a renderer: scenes rendered by Cycles to pictures, and pictures joined to films."""
 
 import tempfile
 import time
@@ -15,12 +15,12 @@ from ...core.figures.page import Page
 from ...core.files import write_bytes
 from ..blender import compat, ids, jobs
 
-_PAUSE = 0.02  # s between two looks at Blender's render job
-_CLEAR = 64  # surfaces of faded modules behind one another that are seen through
+_PAUSE = 0.02  # s between two checks of Blender's render job
+_MAX_TRANSPARENT = 64  # number of surfaces of faded modules, one behind another, that stay transparent
 
 
 def set_up(scene: bpy.types.Scene, page: Page, samples: int) -> None:
-    """Have a scene rendered as 8-bit colours by Cycles, the same on every machine."""
+    """Set a scene up for rendering 8-bit colours by Cycles, the same on every machine."""
     render = scene.render
     try:
         render.engine = "CYCLES"
@@ -31,26 +31,26 @@ def set_up(scene: bpy.types.Scene, page: Page, samples: int) -> None:
     cycles.use_adaptive_sampling, cycles.adaptive_threshold, cycles.adaptive_min_samples = True, 0.05, 4
     cycles.use_denoising, cycles.denoising_prefilter = True, "ACCURATE"
     render.resolution_x, render.resolution_y, render.resolution_percentage = page.width, page.height, 100
-    cycles.transparent_max_bounces = _CLEAR
+    cycles.transparent_max_bounces = _MAX_TRANSPARENT
     render.image_settings.file_format, render.image_settings.color_mode = "PNG", "RGB"
     render.dither_intensity = 0.0
     scene.view_settings.view_transform = "Standard"
 
 
-def written(scene: bpy.types.Scene, path: Path, animation: bool = False) -> Generator[None, None, None]:
-    """Render a scene to a file; in the window as Blender's own job, which its status bar shows and Esc ends."""
-    how = {"animation" if animation else "write_still": True, "scene": scene.name}
+def render_to_file(scene: bpy.types.Scene, path: Path, animation: bool = False) -> Generator[None, None, None]:
+    """Yield while rendering a scene to a file; in a window by Blender's own job, which the status bar shows and Esc ends."""
+    arguments = {"animation" if animation else "write_still": True, "scene": scene.name}
     scene.render.filepath = str(path)
     try:
         if not jobs.is_running():
-            bpy.ops.render.render(**how)
+            bpy.ops.render.render(**arguments)
             return
         view = bpy.context.preferences.view
-        before, view.render_display_type = view.render_display_type, "NONE"
+        old_display_type, view.render_display_type = view.render_display_type, "NONE"
         try:
-            bpy.ops.render.render("INVOKE_DEFAULT", **how)
+            bpy.ops.render.render("INVOKE_DEFAULT", **arguments)
         finally:
-            view.render_display_type = before
+            view.render_display_type = old_display_type
     except RuntimeError as error:
         raise InputError(f"Blender cannot render the figure: {str(error).strip().splitlines()[0]}") from error
     while bpy.app.is_job_running("RENDER"):
@@ -60,8 +60,8 @@ def written(scene: bpy.types.Scene, path: Path, animation: bool = False) -> Gene
         raise Cancelled
 
 
-def pixels(path: Path) -> NDArray[np.uint8]:
-    """Colours (height, width, 3) of a PNG, row 0 at the top."""
+def read_pixels(path: Path) -> NDArray[np.uint8]:
+    """Return the colours (height, width, 3) of a PNG, row 0 at the top."""
     image = bpy.data.images.load(str(path))
     width, height = image.size
     values = np.empty(4 * width * height, np.float32)
@@ -71,7 +71,7 @@ def pixels(path: Path) -> NDArray[np.uint8]:
 
 
 def write_film(pictures: Sequence[Path], path: Path, fps: int, page: Page) -> Generator[None, None, None]:
-    """Put pictures of a page's size, files of one folder, together to an MP4, whole or not at all."""
+    """Yield while joining pictures of a page's size, files of one folder, to an MP4, written whole or not at all."""
     scene = bpy.data.scenes.new(ids.STUDIO)
     try:
         strip = scene.sequence_editor_create().strips.new_image("Film", str(pictures[0]), 1, 1)
@@ -85,8 +85,8 @@ def write_film(pictures: Sequence[Path], path: Path, fps: int, page: Page) -> Ge
         compat.write_films(render.image_settings)
         render.ffmpeg.format, render.ffmpeg.codec, render.ffmpeg.constant_rate_factor = "MPEG4", "H264", "HIGH"
         with tempfile.TemporaryDirectory(prefix="mphdrr-") as folder:
-            made = Path(folder) / "film.mp4"
-            yield from written(scene, made, animation=True)
-            write_bytes(path, made.read_bytes())
+            film = Path(folder) / "film.mp4"
+            yield from render_to_file(scene, film, animation=True)
+            write_bytes(path, film.read_bytes())
     finally:
         bpy.data.scenes.remove(scene)

@@ -1,6 +1,6 @@
-"""Figures of a scene (`core.figures`), and those that Blender renders: by Cycles, on a stage of their own.
+"""Figures of the scene: those of `core.figures`, and those that Blender renders by Cycles in a scene of their own.
 
-It needs no window and no graphics card.
+Neither needs a window or a graphics card.
 """
 
 import glob
@@ -34,46 +34,47 @@ from ..pictures import images
 from ..scanner import pinholes, scanner, selection
 from ..volumes import slices, volume_materials, volumes
 from . import engine
-from .stage import DIRECTION, Stage
+from .stage import DIRECTION, FigureScene
 
 Step = tuple[str, int, int] | None
-"""As a job's finishing yields it (`jobs.Finishing`)."""
+"""Progress of a figure, as a job's finishing yields it (`jobs.Finishing`)."""
 _MISSING = {
     "scanner": "no scanner in the scene: import a workbook first",
     "volume": "no volume in the scene: add a phantom first",
     "run": "no projections: render them first",
 }
-_MOST_RUNS = 6  # of module numbers that a title lists
-_REST = 0.5  # s between two looks at Blender's render job where nothing waits for it
-_SMALL, _TRACE = 240, 8  # pixels across, and of 255: what a volume that can be seen changes in a small picture
-_drawn: set[tuple[str, str, float, float]] = set()  # volumes and looks that Cycles is known to draw
+_MAX_RUNS = 6  # number of ranges of module numbers that a title lists
+_PAUSE = 0.5  # s between two checks of Blender's own render job
+# A volume is visible if it changes a small picture, so many pixels wide, by more than this, of 255.
+_SMALL_SIZE, _THRESHOLD = 240, 8
+_known_visible: set[tuple[str, str, float, float]] = set()  # files and looks of volumes that Cycles has drawn
 _UNDRAWN = "Low and High draw none of its values, or this Blender's Cycles draws no volumes"
 _UNSEEN = f": its file is missing, {_UNDRAWN}"
 _AXES = {"dark": ("#ff8a80", "#8ee59a", "#8cb8ff"), "light": ("#c62828", "#2e7d32", "#1f57c3")}  # x, y and z
-_STEPS = (1.0, 2.0, 5.0)  # round numbers of scale bars
-_VEIL = 0.7  # how much of the paper covers what is under labels
-_SCALE = 0.2  # of the picture's width that a scale bar takes at most
+_STEPS = (1.0, 2.0, 5.0)  # leading digits of scale bars' lengths
+_VEIL = 0.7  # opacity of the paper under labels
+_BAR_SHARE = 0.2  # largest length of a scale bar, relative to the picture's width
 
 
 class Reel(threading.Event):
-    """The pictures that an animation has so far; where it is set, they are enough."""
+    """Pictures of an animation so far; the event is set to end the animation with these."""
 
     pictures: Sequence[Path] = ()
 
 
 @dataclass(frozen=True)
 class _Ramp(Display):
-    """The colours of a volume's smoke."""
+    """Colours of a volume's smoke."""
 
     ramp: volume_materials.Ramp = ()
 
     def colored(self, values: ArrayLike, window: tuple[float, float] | None = None) -> NDArray[np.uint8]:
-        table = np.rint(255 * slices.colors("", self.ramp)[:, :3]).astype(np.uint8)
+        table = np.rint(255 * slices.color_table("", self.ramp)[:, :3]).astype(np.uint8)
         return table[np.rint(255 * self.shares(values, window or self.window(values))).astype(int)]
 
 
 def kind_items(films: bool = False) -> tuple[tuple[Any, ...], ...]:
-    """Choices of an EnumProperty: the kinds of figures, animations or others."""
+    """Return the kinds of animations, or of other figures, as choices of an enumeration."""
     kinds = (kind for kind in KINDS.values() if bool(kind.motion) == films)
     return items({}, ((kind.name.upper().replace("-", "_"), kind.label, kind.summary) for kind in kinds))
 
@@ -84,17 +85,17 @@ def figure_job(
     paths: Sequence[Path],
     size: tuple[int, int] | None = None,
     modules: str | None = None,
-    **how: Any,
+    **style: Any,
 ) -> jobs.Job:
-    """The job that writes a figure of the context's scene to files (.png, .svg; .mp4), `size` pixels wide and high.
+    """Return the job that writes a figure of the context's scene to files (.png, .svg; .mp4), `size` pixels wide and high.
 
-    `modules` are all by default; of figures of one module, the active one; of a picture those selected, if more than one is.
-    `how` are the fields of `core.figures.kinds.Rendering`. Raises InputError where the scene has not what the figure
-    needs.
+    `modules` are all by default; for a figure of one module, the active one; for a picture the selected ones, if there are
+    several. `style` are the fields of `core.figures.kinds.Rendering`. Raises InputError where the scene lacks what the
+    figure needs.
     """
-    given = Rendering(**how)
+    options = Rendering(**style)
     kind, scene = figure_kind(name), context.scene
-    page = kind.page(size, given)
+    page = kind.page(size, options)
     paths = [output_path(str(path), kind.suffixes) for path in paths]
     collection = scanner.active_scanner(scene)
     item = _volume_item(context) if "volume" in kind.needs else None
@@ -104,232 +105,233 @@ def figure_job(
     selected = [camera.mphdrr_module.number for camera in selection.selected_modules(context)]
     if kind.studio is not None and kind.studio.lit and modules is None and len(selected) > 1:
         modules = ",".join(map(str, selected))
-    known: dict[str, Any] = {"modules": modules, "display": scene.mphdrr_display.display()}
+    subject_values: dict[str, Any] = {"modules": modules, "display": scene.mphdrr_display.display()}
     if collection is not None:
-        known["scanner"] = scanner.read_scanner(collection)
-        known["construction"] = pinholes.construction(collection.mphdrr_scanner)
-    later: dict[str, Callable[[], Any]] = {}
+        subject_values["scanner"] = scanner.read_scanner(collection)
+        subject_values["construction"] = pinholes.construction(collection.mphdrr_scanner)
+    readers: dict[str, Callable[[], Any]] = {}
     if item is not None:
         pose = volumes.pose_of_object(item)
-        later["volume"], known["name"] = volumes.reader(item), item.name
+        readers["volume"], subject_values["name"] = volumes.reader(item), item.name
         if phantoms.settings_of(item) is not None or not np.array_equal(pose, np.eye(4)):
-            known["pose"] = pose
+            subject_values["pose"] = pose
     run_file = scene.mphdrr_projections.run_file
     if "run" in kind.needs and run_file:
-        later["run"] = partial(read_run, storage.absolute(run_file))
-    require(kind.needs, {*known, *later}, kind.name, _MISSING)
+        readers["run"] = partial(read_run, storage.absolute(run_file))
+    require(kind.needs, {*subject_values, *readers}, kind.name, _MISSING)
 
     def work(progress: Progress) -> FigureSubject:
         progress(0, 1)
-        found = {key: read() for key, read in later.items()}
-        if "run" in found:
-            known["name"] = found["run"].settings.get("volume", "")
-        return FigureSubject(**known, **found)
+        read_values = {key: read() for key, read in readers.items()}
+        if "run" in read_values:
+            subject_values["name"] = read_values["run"].settings.get("volume", "")
+        return FigureSubject(**subject_values, **read_values)
 
     reel = Reel()
 
     def finish(subject: FigureSubject) -> Generator[Step, None, str]:
-        yield from drawing(page, subject, kind, item, paths, given, reel)
+        yield from draw_figure(page, subject, kind, item, paths, options, reel)
         if windows.has_window() and paths[0].suffix == ".png":
             images.show_file(paths[0], bpy.context)
         return f"Wrote {', '.join(map(str, paths))}"
 
-    def left() -> str:
-        made = reel.pictures
-        return f"{len(made)} pictures are in {made[0].parent}" if made else "nothing was changed"
+    def leftovers() -> str:
+        pictures = reel.pictures
+        return f"{len(pictures)} pictures are in {pictures[0].parent}" if pictures else "nothing was changed"
 
-    return jobs.Job("Drawing the figure", work, finish, enough=reel if kind.motion else None, left=left)
+    return jobs.Job("Drawing the figure", work, finish, finish_now=reel if kind.motion else None, leftovers=leftovers)
 
 
-def drawing(
+def draw_figure(
     page: Page,
     subject: FigureSubject,
     kind: FigureKind,
     item: bpy.types.Object | None,
     paths: Sequence[Path],
-    how: Rendering,
+    style: Rendering,
     reel: Reel,
 ) -> Generator[Step, None, None]:
-    """Draw a figure on its page and write it to `paths`; yields while Blender's own job renders, and pictures of a film.
+    """Draw a figure on its page and write it to `paths`; yield while Blender's own job renders, and after each picture.
 
-    The volume that is rendered is that of an object. A film's pictures, in the folder NAME-frames beside NAME.mp4, stay if
-    the work is ended; where `reel` is set, the film ends with those.
+    `item` is the object of the volume to render. A film's pictures, in the folder NAME-frames beside NAME.mp4, stay if the
+    work is ended; where `reel` is set, the film ends with the pictures so far.
     """
     if kind.draw is not None:
         kind.draw(page, subject)
     if kind.studio is not None:
-        stage = Stage(subject, kind, item, page, heading_height(page, 1) if how.labels else 0)
+        stage = FigureScene(subject, kind, item, page, heading_height(page, 1) if style.labels else 0)
         try:
-            yield from _prepared(stage, how)
+            yield from _set_up(stage, style)
             for path in paths if kind.motion else ():
-                yield from _filmed(stage, how, path, reel)
+                yield from _render_film(stage, style, path, reel)
             if not kind.motion:
-                yield from _picture(stage, how, page)
+                yield from _render_picture(stage, style, page)
         finally:
             stage.remove()
     for path in () if kind.motion else paths:
         page.write(path)
 
 
-def _filmed(stage: Stage, how: Rendering, path: Path, reel: Reel) -> Generator[Step, None, None]:
-    """Render an animation's pictures, and put them together to an MP4."""
-    made = reel.pictures = []
+def _render_film(stage: FigureScene, style: Rendering, path: Path, reel: Reel) -> Generator[Step, None, None]:
+    """Render an animation's pictures, and join them to an MP4."""
+    pictures = reel.pictures = []
     folder = files.ensure_folder(path.with_name(f"{path.stem}-frames"))
-    for old in folder.glob(f"{glob.escape(path.stem)}-[0-9][0-9][0-9][0-9].png"):
-        old.unlink()  # of an animation that may have been longer
-    shown, page = None, stage.page
-    for k in range(how.frames):
-        moment = stage.moment(k / how.frames)
-        if moment != shown:
+    for old_picture in folder.glob(f"{glob.escape(path.stem)}-[0-9][0-9][0-9][0-9].png"):
+        old_picture.unlink()  # an older animation may have been longer
+    shown_moment, page = None, stage.page
+    for k in range(style.frames):
+        moment = stage.moment(k / style.frames)
+        if moment != shown_moment:
             stage.show(*moment)
-            shown, page = moment, Page(page.width, page.height, page.paper)
-            yield from _picture(stage, how, page)
-        made.append(folder / f"{path.stem}-{k + 1:04d}.png")
-        page.write(made[-1])
-        yield "rendering pictures", k + 1, how.frames
+            shown_moment, page = moment, Page(page.width, page.height, page.paper)
+            yield from _render_picture(stage, style, page)
+        pictures.append(folder / f"{path.stem}-{k + 1:04d}.png")
+        page.write(pictures[-1])
+        yield "rendering pictures", k + 1, style.frames
         if reel.is_set():
             break
-    yield from engine.write_film(made, path, how.fps, page)
+    yield from engine.write_film(pictures, path, style.fps, page)
 
 
-def _prepared(stage: Stage, how: Rendering) -> Generator[None, None, None]:
-    """Set up Cycles for a stage; a volume that it does not draw becomes a surface, which is said."""
-    engine.set_up(stage.scene, stage.page, how.samples)
+def _set_up(stage: FigureScene, style: Rendering) -> Generator[None, None, None]:
+    """Set up Cycles for a figure's scene; a volume that Cycles does not draw becomes a surface, with a warning."""
+    engine.set_up(stage.scene, stage.page, style.samples)
     item, volume = stage.item, stage.subject.volume
-    if item is None or not stage.drawn or (yield from _leave_a_trace(stage.scene, stage.drawn)):
+    if item is None or not stage.volume_objects or (yield from _are_visible(stage.scene, stage.volume_objects)):
         return
     if volume is None:
         warn(f"the picture shows nothing of {item.name!r}{_UNSEEN}")
         return
-    settings, factor = item.mphdrr_volume, volume_materials.shown_unit(item.mphdrr_volume.quantity)[1]
+    settings, factor = item.mphdrr_volume, volume_materials.display_unit(item.mphdrr_volume.quantity)[1]
     level = min((settings.display_low + settings.display_high) / factor, float(volume.array.max())) / 2
-    stage.draw_surface(volume_to_mesh(volume, level), volume_materials.ramp_of(item, smoke=True))
+    stage.draw_surface(volume_to_mesh(volume, level), volume_materials.item_ramp(item, smoke=True))
     warn(f"the picture shows {item.name!r} as the surface at {level * factor:.3g} {settings.unit}: {_UNDRAWN}")
 
 
-def _picture(stage: Stage, how: Rendering, page: Page) -> Generator[None, None, None]:
-    """Render a stage, as it is now, onto a page."""
-    page.image((yield from _render(stage.scene)), 0, 0, page.width, page.height)
-    if how.labels:
+def _render_picture(stage: FigureScene, style: Rendering, page: Page) -> Generator[None, None, None]:
+    """Render a figure's scene, as it is now, onto a page."""
+    page.image((yield from _render_pixels(stage.scene)), 0, 0, page.width, page.height)
+    if style.labels:
         _label(stage, page)
 
 
-def _label(stage: Stage, page: Page) -> None:
-    """Write on a picture what it shows, and how large."""
+def _label(stage: FigureScene, page: Page) -> None:
+    """Write title, axes, scale bar and colour bar on a picture."""
     em, title, line = page.em, *_titles(stage)
-    if stage.shown.near:  # what is shown reaches under the title
+    if stage.studio.near:  # the scene reaches under the title
         page.area(box(0, 0, page.width, stage.top), page.paper, _VEIL)
     heading(page, title, [line], page.ink, page.faint)
     _draw_axes(page, stage.camera)
-    if not stage.shown.volume:
+    if not stage.studio.volume:
         return
-    longest = _SCALE * page.width / stage.pixels_per_mm
+    longest = _BAR_SHARE * page.width / stage.pixels_per_mm
     length = max(n * 10.0**k for n in _STEPS for k in range(-3, 5) if n * 10.0**k <= longest)
     end, row = 1.2 * em + length * stage.pixels_per_mm, page.height - 1.4 * em
     page.area(box(0.6 * em, row - 2.2 * em, end, 3.0 * em), page.paper, _VEIL)
     page.line([(1.2 * em, row), (end, row)], page.ink, 0.25 * em)
     page.text(f"{length:g} mm", (1.2 * em + end) / 2, row - 0.6 * em, em, page.ink, "middle")
-    if stage.item is not None and [part.type for part in stage.drawn] == ["VOLUME"]:
+    if stage.item is not None and [part.type for part in stage.volume_objects] == ["VOLUME"]:
         settings = stage.item.mphdrr_volume
         window = settings.display_low, settings.display_high
-        ramp = _Ramp(ramp=volume_materials.ramp_of(stage.item, smoke=True))
-        left, tall = page.width - round(em) - bar_width(page, ramp, window, settings.unit), round(11 * em)
-        page.area(box(left - em, page.height - tall - 4.2 * em, page.width, tall + 4.2 * em), page.paper, _VEIL)
-        color_bar(page, ramp, window, settings.unit, left, page.height - tall - round(1.4 * em), tall)
+        ramp = _Ramp(ramp=volume_materials.item_ramp(stage.item, smoke=True))
+        left, height = page.width - round(em) - bar_width(page, ramp, window, settings.unit), round(11 * em)
+        page.area(box(left - em, page.height - height - 4.2 * em, page.width, height + 4.2 * em), page.paper, _VEIL)
+        color_bar(page, ramp, window, settings.unit, left, page.height - height - round(1.4 * em), height)
 
 
 def _volume_item(context: bpy.types.Context) -> bpy.types.Object | None:
-    """The active volume, else the panel's, else the only one; None where there is none."""
-    known = volumes.volume_objects(context.scene)
-    for chosen in (context.object, context.scene.mphdrr_projections.volume):
-        if chosen in known:
-            return chosen
-    if len(known) > 1:
-        raise InputError(f"choose what to show: there are {len(known)} volumes; select one")
-    return known[0] if known else None
+    """Return the active volume, else the panel's, else the only one; None where there is none."""
+    scene_volumes = volumes.volume_objects(context.scene)
+    for candidate in (context.object, context.scene.mphdrr_projections.volume):
+        if candidate in scene_volumes:
+            return candidate
+    if len(scene_volumes) > 1:
+        raise InputError(f"choose what to show: there are {len(scene_volumes)} volumes; select one")
+    return scene_volumes[0] if scene_volumes else None
 
 
-def _titles(stage: Stage) -> tuple[str, str]:
-    """What is written on a rendered figure: a title and a line below it."""
-    numbers = np.array(stage.shining if stage.shown.lit else stage.system.numbers)
+def _titles(stage: FigureScene) -> tuple[str, str]:
+    """Return the title of a rendered figure and the line below it."""
+    numbers = np.array(stage.ray_numbers if stage.studio.lit else stage.system.numbers)
     runs = np.split(numbers, np.flatnonzero(np.diff(numbers) != 1) + 1)
-    listed = ", ".join(f"{run[0]}–{run[-1]}" if len(run) > 1 else str(run[0]) for run in runs[:_MOST_RUNS])
-    listed += " …" if len(runs) > _MOST_RUNS else ""
+    listed = ", ".join(f"{run[0]}–{run[-1]}" if len(run) > 1 else str(run[0]) for run in runs[:_MAX_RUNS])
+    listed += " …" if len(runs) > _MAX_RUNS else ""
     modules = f"{'Module' if len(numbers) == 1 else 'Modules'} {listed}"
-    name, within = stage.subject.name if stage.shown.volume else "", f"ROI of radius {stage.radius:g} mm"
-    if stage.shown.lit:
-        return name, f"Rays of {modules.lower()} of {len(stage.system)}, {within}"
-    return modules, ", ".join(filter(None, (name, within)))
+    name, roi = stage.subject.name if stage.studio.volume else "", f"ROI of radius {stage.radius:g} mm"
+    if stage.studio.lit:
+        return name, f"Rays of {modules.lower()} of {len(stage.system)}, {roi}"
+    return modules, ", ".join(filter(None, (name, roi)))
 
 
-def _leave_a_trace(scene: bpy.types.Scene, drawn: list[bpy.types.Object]) -> Generator[None, None, bool]:
-    """Whether objects are to be seen at all, by small pictures with and without them."""
+def _are_visible(scene: bpy.types.Scene, items: list[bpy.types.Object]) -> Generator[None, None, bool]:
+    """Return whether objects are visible at all, by small pictures with and without them."""
     render, cycles, pictures = scene.render, scene.cycles, []
-    render.resolution_percentage, cycles.use_denoising = min(100, -(-100 * _SMALL // render.resolution_x)), False
+    render.resolution_percentage, cycles.use_denoising = min(100, -(-100 * _SMALL_SIZE // render.resolution_x)), False
     samples, cycles.samples = cycles.samples, SAMPLES
-    for hidden in (True, False):
-        for part in drawn:
-            part.hide_render = hidden
-        pictures.append((yield from _render(scene)).astype(int))
+    for is_hidden in (True, False):
+        for item in items:
+            item.hide_render = is_hidden
+        pictures.append((yield from _render_pixels(scene)).astype(int))
     render.resolution_percentage, cycles.use_denoising, cycles.samples = 100, True, samples
-    rows, columns = (n // 8 for n in pictures[0].shape[:2])  # means, which have less noise
-    return bool(np.abs(resized(pictures[0] - pictures[1], rows, columns)).max() > _TRACE)
+    rows, columns = (n // 8 for n in pictures[0].shape[:2])  # means over blocks have less noise
+    return bool(np.abs(resized(pictures[0] - pictures[1], rows, columns)).max() > _THRESHOLD)
 
 
 def before_render(scene: bpy.types.Scene, *_: Any) -> None:
-    """Blender's own Render: say which volumes of the 3D views the picture lacks; in the window, when it is done."""
+    """Report volumes of the 3D views that Blender's own render lacks; in a window, once the render is done."""
     if scene.name.startswith(ids.STUDIO):
         return
     if bpy.app.background:
-        _say_what_is_unseen()
+        _report_unseen()
     else:
-        timers.soon(_say_what_is_unseen, _REST)
+        timers.schedule(_report_unseen, _PAUSE)
 
 
-def _say_what_is_unseen() -> float | None:
+def _report_unseen() -> float | None:
+    """Report the volumes of the 3D views that a render does not show, with the reason; wait while something renders."""
     if jobs.is_running() or bpy.app.is_job_running("RENDER"):
-        return _REST
+        return _PAUSE
     scene, missing = bpy.context.scene, storage.missing_volumes()
     for item in (item for item in volumes.volume_objects(scene) if item.visible_get()):
-        look, why = item.mphdrr_volume, ""
-        known = item.data.filepath, look.look, look.display_low, look.display_high
+        look, reason = item.mphdrr_volume, ""
+        key = item.data.filepath, look.look, look.display_low, look.display_high
         if item.hide_render or all(home.hide_render for home in item.users_collection):
-            why = ": it is hidden in renders"
+            reason = ": it is hidden in renders"
         elif item.data in missing:
-            why = ": its files are missing"
-        elif scene.render.engine == "CYCLES" and known not in _drawn:
+            reason = ": its files are missing"
+        elif scene.render.engine == "CYCLES" and key not in _known_visible:
             reach = max((item.matrix_world @ Vector(corner)).length for corner in item.bound_box) + 1.0
-            sizes = reach / np.array([50, 10, 10, 50, 1])  # of a small module behind it, as seen
-            with recording.recorded_warnings() as caught:
+            sizes = reach / np.array([50, 10, 10, 50, 1])  # of a small module behind the volume
+            with recording.recorded_warnings() as warnings:
                 subject = FigureSubject(PinholeSystem(-2 * reach * DIRECTION[None], *sizes))
-                page, how = Page(_SMALL, _SMALL), Rendering(labels=False, samples=1)
-                list(drawing(page, subject, figure_kind("inside"), item, [], how, Reel()))
-            why = _UNSEEN if any(_UNSEEN in text for text in caught) else ""
-            _drawn.update([] if why else [known])
-        if why:
-            text = f"the picture shows nothing of {item.name!r}{why}"
+                page, options = Page(_SMALL_SIZE, _SMALL_SIZE), Rendering(labels=False, samples=1)
+                list(draw_figure(page, subject, figure_kind("inside"), item, [], options, Reel()))
+            reason = _UNSEEN if any(_UNSEEN in text for text in warnings) else ""
+            _known_visible.update([] if reason else [key])
+        if reason:
+            text = f"the picture shows nothing of {item.name!r}{reason}"
             print(f"mphDRR: {text}", file=sys.stderr)
             if not bpy.app.background:
-                line = partial(lambda text, menu, _: menu.layout.label(text=text), text)
-                bpy.context.window_manager.popup_menu(line, title="mphDRR", icon="ERROR")
+                draw_line = partial(lambda text, menu, _: menu.layout.label(text=text), text)
+                bpy.context.window_manager.popup_menu(draw_line, title="mphDRR", icon="ERROR")
     return None
 
 
-def _render(scene: bpy.types.Scene) -> Generator[None, None, NDArray[np.uint8]]:
-    """Colours (height, width, 3) of a scene."""
+def _render_pixels(scene: bpy.types.Scene) -> Generator[None, None, NDArray[np.uint8]]:
+    """Return the colours (height, width, 3) of a rendered scene."""
     with tempfile.TemporaryDirectory(prefix="mphdrr-") as folder:
         path = Path(folder) / "figure.png"
-        yield from engine.written(scene, path)
-        return engine.pixels(path)
+        yield from engine.render_to_file(scene, path)
+        return engine.read_pixels(path)
 
 
 def _draw_axes(page: Page, camera: bpy.types.Object) -> None:
-    """The directions of x, y and z, in the upper right corner beside the title."""
+    """Draw the directions of x, y and z in the upper right corner, beside the title."""
     em = page.em
     x, y = page.width - 3.2 * em, 2.9 * em
     colors = _AXES["dark" if page.paper == DARK else "light"]
     right, up, back = np.array(camera.rotation_quaternion.to_matrix()).T
-    for axis in np.argsort(back):  # the nearest last
-        across, down, color = right[axis] * em, -up[axis] * em, colors[axis]
-        page.line([(x, y), (x + 1.4 * across, y + 1.4 * down)], color, 0.14 * em)
-        page.text("xyz"[axis], x + 2.0 * across, y + 2.0 * down + 0.3 * em, 0.9 * em, color, "middle")
+    for axis in np.argsort(back):  # draws the nearest axis last
+        dx, dy, color = right[axis] * em, -up[axis] * em, colors[axis]
+        page.line([(x, y), (x + 1.4 * dx, y + 1.4 * dy)], color, 0.14 * em)
+        page.text("xyz"[axis], x + 2.0 * dx, y + 2.0 * dy + 0.3 * em, 0.9 * em, color, "middle")

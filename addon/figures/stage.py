@@ -1,7 +1,7 @@
-"""What figures are rendered of: a scene of its own with copies of what is shown, so that the user's stays as it is.
+"""Scenes for rendered figures: copies of scanner and volume in a scene of their own, so that the user's stays as it is.
 
-The camera sees the figure's paper behind it. Each module can be lit, and fades where it would stand between the viewer and
-the isocentre.
+The camera sees the figure's paper behind the scene. Each module can be lit, and fades where it would stand between the
+viewer and the isocentre.
 """
 
 from functools import partial
@@ -21,156 +21,158 @@ from ..volumes import looks, meshes, volume_materials
 from . import studio
 
 Moment = tuple[float, list[int], list[int]]
-"""The camera's turn about the z axis, radians; the modules that are lit, and those whose rays are seen."""
+"""Turn of the camera about the z axis, rad; numbers of the lit modules; numbers of the modules with visible rays."""
 Points = NDArray[np.float64]
 DIRECTION = np.array(Vector((0.45, -1.0, 0.75)).normalized())
-"""From the scanner to the camera."""
-_FILM = 36.0  # mm, of the camera
-_MARGIN = 0.04  # of the picture's shorter side, free around what is shown
-_SOLID, _GONE = 0.1, 0.5  # how far to the front, of 1, a pinhole's module begins to fade, and is cut away
-_GHOST = 0.3  # how much of a module that is lit is there at least
-_RAY_RADIUS = 0.006  # of the ROI's radius
-_ACCENT = (1.0, 0.40, 0.03, 1.0)  # linear RGBA: rays, and modules that are lit
-_DULL = 0.3  # how much of the metal's gloss is left
-_SHINE, _TINT = 0.3, 0.8  # of lit modules: how much they glow, and how far they are of the accent's colour
-_WORLD = 0.9  # how bright the surroundings are, which metal reflects
+"""Direction from the scanner to the camera."""
+_SENSOR_WIDTH = 36.0  # of the camera, mm
+_MARGIN = 0.04  # free margin around the scene, relative to the picture's shorter side
+# Cosine between the directions to a module and to the camera at which the module begins to fade, and at which it is gone.
+_SOLID, _GONE = 0.1, 0.5
+_MIN_OPACITY = 0.3  # of a module that is lit alone
+_RAY_RADIUS = 0.006  # relative to the ROI's radius
+_ACCENT = (1.0, 0.40, 0.03, 1.0)  # linear RGBA of rays and lit modules
+_METALLIC_FACTOR = 0.3  # factor on the metallic look of materials, which would mirror the surroundings
+_GLOW, _TINT = 0.3, 0.8  # emission strength of lit modules, and share of the accent in their colour
+_WORLD = 0.9  # brightness of the surroundings, which metal reflects
 
-_TURNS = np.linspace(0.0, 2 * np.pi, 64, endpoint=False)
-_BALL = np.stack(  # points (N, 3) of a sphere of radius 1
+_ANGLES = np.linspace(0.0, 2 * np.pi, 64, endpoint=False)
+_SPHERE = np.stack(  # points (N, 3) of a sphere of radius 1
     [
-        np.outer(np.cos(_TURNS), np.sin(_TURNS / 2)),
-        np.outer(np.sin(_TURNS), np.sin(_TURNS / 2)),
-        np.outer(np.ones(64), np.cos(_TURNS / 2)),
+        np.outer(np.cos(_ANGLES), np.sin(_ANGLES / 2)),
+        np.outer(np.sin(_ANGLES), np.sin(_ANGLES / 2)),
+        np.outer(np.ones(64), np.cos(_ANGLES / 2)),
     ],
     axis=-1,
 ).reshape(-1, 3)
 
 
-class Stage:
-    """A subject's scanner and the volume of an object, in a scene of their own, with a camera that sees them on a page."""
+class FigureScene:
+    """Scanner of a subject and volume of an object in a scene of their own, with a camera that frames them on a page."""
 
     def __init__(
         self, subject: FigureSubject, kind: FigureKind, item: bpy.types.Object | None, page: Page, top: int
     ) -> None:
         assert subject.scanner is not None and kind.studio is not None
         self.subject, self.item, self.page, self.top = subject, item, page, top
-        self.shown, self._motion = shown, motion = kind.studio, kind.motion
-        self.whole = subject.scanner
-        chosen = subject.select_modules(self.whole)
-        if shown.lit and subject.modules is None and motion != "light":  # of all rays none could be told apart
-            chosen = chosen[chosen.rings() == chosen.rings().max() // 2]
-        self.numbers: list[int] = chosen.numbers.tolist()
-        """Of the chosen modules."""
-        self.system = self.whole if shown.lit else chosen
+        self.studio, self._motion = view, motion = kind.studio, kind.motion
+        self.full_system = subject.scanner
+        chosen_system = subject.select_modules(self.full_system)
+        if view.lit and subject.modules is None and motion != "light":  # all rays together could not be told apart
+            chosen_system = chosen_system[chosen_system.rings() == chosen_system.rings().max() // 2]
+        self.numbers: list[int] = chosen_system.numbers.tolist()
+        """Numbers of the chosen modules."""
+        self.system = self.full_system if view.lit else chosen_system
         self.scene = scene = bpy.data.scenes.new(ids.STUDIO)
-        self.radius = self.whole.region_radius()
-        self.drawn: list[bpy.types.Object] = []
+        self.radius = self.full_system.region_radius()
+        self.volume_objects: list[bpy.types.Object] = []
         self._modules = list[tuple[bpy.types.Mesh, NDArray[np.intp]]]()
         try:
             studio.furnish(scene)
             scene.frame_set(bpy.context.scene.frame_current)
-            _backdrop(scene.world, page.paper)
-            self._put_modules()
-            roi = self.put(collimators.new_sphere(ids.STUDIO, self.radius, collimators.part_material("ROI")))
+            _set_backdrop(scene.world, page.paper)
+            self._add_modules()
+            roi = self.add_object(collimators.new_sphere(ids.STUDIO, self.radius, collimators.part_material("ROI")))
             roi.visible_shadow = False
-            if shown.volume and item is not None:
-                self._put_volume(item)
-            self.rays = self._put_rays() if shown.rays else {}
-            self.camera = scene.camera = self.put(bpy.data.cameras.new(ids.STUDIO))
-            self.camera.data.lens, self.camera.data.sensor_width = shown.lens, _FILM
+            if view.volume and item is not None:
+                self._add_volume(item)
+            self.rays = self._add_rays() if view.rays else {}
+            self.camera = scene.camera = self.add_object(bpy.data.cameras.new(ids.STUDIO))
+            self.camera.data.lens, self.camera.data.sensor_width = view.lens, _SENSOR_WIDTH
             self.show(0.0, self.numbers, self.numbers)
         except BaseException:
             self.remove()
             raise
 
-    def put(self, data: bpy.types.ID) -> bpy.types.Object:
-        """A new object in the scene."""
+    def add_object(self, data: bpy.types.ID) -> bpy.types.Object:
+        """Return a new object in the scene."""
         item = bpy.data.objects.new(ids.STUDIO, data)
         self.scene.collection.objects.link(item)
         return item
 
     def show(self, turn: float, lit: list[int], rays: list[int]) -> None:
-        """Show a moment: the camera where it is then, and let those modules fade that stand in its way."""
+        """Show a moment: place the camera, light modules, and let those fade that stand in the camera's way."""
         cos, sin = np.cos(turn), np.sin(turn)
         direction = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]]) @ DIRECTION
-        points = (self.shown.near or 1.0) * self.radius * _BALL
-        if not self.shown.near:
-            points = np.concatenate([points, *(part.vertices for part in self.whole.parts())])
-        aim(self.camera, direction, self.page, points, self.top)
-        # What is at the isocentre is shown as large:
+        points = (self.studio.near or 1.0) * self.radius * _SPHERE
+        if not self.studio.near:
+            points = np.concatenate([points, *(part.vertices for part in self.full_system.parts())])
+        aim_camera(self.camera, direction, self.page, points, self.top)
+        # The scale at the isocentre.
         longer, distance = max(self.page.width, self.page.height), float(np.array(self.camera.location) @ direction)
-        self.pixels_per_mm = longer * self.shown.lens / _FILM / distance
-        numbers, self.shining = self.system.numbers, rays
+        self.pixels_per_mm = longer * self.studio.lens / _SENSOR_WIDTH / distance
+        numbers, self.ray_numbers = self.system.numbers, rays
         front = -self.system.frames()[:, 2] @ direction
-        there = np.clip((_GONE - front) / (_GONE - _SOLID), 0.0, 1.0) if self.shown.cut else np.ones(len(numbers))
-        there = np.maximum(there, _GHOST * np.isin(numbers, rays) * (len(rays) == 1))
-        values = {"lit": _TINT * np.isin(numbers, lit) * self.shown.lit, "there": there}
+        opacity = np.clip((_GONE - front) / (_GONE - _SOLID), 0.0, 1.0) if self.studio.cut else np.ones(len(numbers))
+        opacity = np.maximum(opacity, _MIN_OPACITY * np.isin(numbers, rays) * (len(rays) == 1))
+        values = {"lit": _TINT * np.isin(numbers, lit) * self.studio.lit, "there": opacity}
         for mesh, module in self._modules:
             for name, value in values.items():
                 mesh.attributes[name].data.foreach_set("value", value[module].astype(np.float32))
             mesh.update()
-        for number, share in zip(numbers.tolist(), there, strict=True):
+        for number, share in zip(numbers.tolist(), opacity, strict=True):
             if number in self.rays:
                 self.rays[number].hide_render = number not in rays or not share
 
     def moment(self, share: float) -> Moment:
-        """What an animation shows after a share of its time."""
+        """Return camera angle, lit modules and modules with rays at fraction `share` of the animation."""
         if self._motion == "turn":
             return 2 * np.pi * share, self.numbers, self.numbers
-        now = int(share * len(self.numbers))
-        return 0.0, self.numbers[: now + 1], [self.numbers[now]]
+        index = int(share * len(self.numbers))
+        return 0.0, self.numbers[: index + 1], [self.numbers[index]]
 
     def draw_surface(self, mesh: Mesh, colors: volume_materials.Ramp) -> None:
         """Draw a mesh in the place of the volume."""
-        for part in self.drawn:
+        for part in self.volume_objects:
             part.hide_render = True
         surface = meshes.add_mesh(mesh, ids.STUDIO, np.eye(4), self.scene.collection)
         surface.data.materials.append(looks.new_material(ids.STUDIO, colors))
-        self.drawn = [surface]
+        self.volume_objects = [surface]
 
     def remove(self) -> None:
-        """Remove the studio, all but the volume's data."""
+        """Remove the scene and everything in it, except the volume's data."""
         scene = self.scene
-        found = list(scene.collection.all_objects)
-        datas = {item.data for item in found if item.type != "VOLUME"}
-        materials = {m for data in datas for m in getattr(data, "materials", ()) if m.name.startswith(ids.STUDIO)}
-        homes, world = list(scene.collection.children), scene.world
+        items = list(scene.collection.all_objects)
+        datablocks = {item.data for item in items if item.type != "VOLUME"}
+        materials = {m for data in datablocks for m in getattr(data, "materials", ()) if m.name.startswith(ids.STUDIO)}
+        collections, world = list(scene.collection.children), scene.world
         bpy.data.scenes.remove(scene)
-        bpy.data.batch_remove([*found, *datas, *materials, *homes, *filter(None, [world])])
+        bpy.data.batch_remove([*items, *datablocks, *materials, *collections, *filter(None, [world])])
 
-    def _put_modules(self) -> None:
-        """All collimators as one object, and all crystals."""
+    def _add_modules(self) -> None:
+        """Add all collimators as one object, and all crystals as another."""
         numbered = dict(zip(self.system.numbers.tolist(), range(len(self.system)), strict=True))
         parts = self.system.parts(self.subject.construction)
         for kind in dict.fromkeys(part.kind for part in parts):
-            chosen = [part for part in parts if part.kind == kind]
-            firsts = np.cumsum([0, *(len(part.vertices) for part in chosen)])
-            faces = [part.solid[1] + first for part, first in zip(chosen, firsts[:-1], strict=True)]
+            kind_parts = [part for part in parts if part.kind == kind]
+            firsts = np.cumsum([0, *(len(part.vertices) for part in kind_parts)])
+            faces = [part.solid[1] + first for part, first in zip(kind_parts, firsts[:-1], strict=True)]
             mesh = bpy.data.meshes.new(ids.STUDIO)
-            vertices = np.concatenate([part.vertices for part in chosen])
+            vertices = np.concatenate([part.vertices for part in kind_parts])
             collimators.reshape_mesh(mesh, (vertices, np.concatenate(faces)))
-            mesh.materials.append(_material(kind.upper()))
+            mesh.materials.append(_figure_material(kind.upper()))
             for name in ("lit", "there"):
                 mesh.attributes.new(name, "FLOAT", "FACE")
-            module = np.repeat([numbered[part.number] for part in chosen], [len(f) for f in faces])
+            module = np.repeat([numbered[part.number] for part in kind_parts], [len(f) for f in faces])
             self._modules.append((mesh, module))
-            self.put(mesh)
+            self.add_object(mesh)
 
-    def _put_volume(self, item: bpy.types.Object) -> None:
-        self.drawn = [self.put(item.data)]
-        self.drawn[0].matrix_world = item.matrix_world
+    def _add_volume(self, item: bpy.types.Object) -> None:
+        """Add the volume's object, with a copy of its surface if it has one."""
+        self.volume_objects = [self.add_object(item.data)]
+        self.volume_objects[0].matrix_world = item.matrix_world
         surface = looks.surface_of(item)
-        if surface is not None:  # of a look that draws no smoke
+        if surface is not None:  # its look draws a surface instead of smoke
             copy = surface.copy()
             copy.data, copy.parent = surface.data.copy(), None
             self.scene.collection.objects.link(copy)
             copy.matrix_world = surface.matrix_world
-            self.drawn.append(copy)
+            self.volume_objects.append(copy)
 
-    def _put_rays(self) -> dict[int, bpy.types.Object]:
-        """The principal rays by modules' numbers, from each pinhole to the isocentre, as thin shining tubes."""
-        material, shine = compat.surface_material(ids.STUDIO, "ShaderNodeEmission")
-        shine.inputs["Color"].default_value = _ACCENT
+    def _add_rays(self) -> dict[int, bpy.types.Object]:
+        """Return the principal rays by module number: thin shining tubes from each pinhole to the isocentre."""
+        material, emission = compat.surface_material(ids.STUDIO, "ShaderNodeEmission")
+        emission.inputs["Color"].default_value = _ACCENT
         rays = {}
         for number, center in zip(self.system.numbers.tolist(), self.system.poses()[:, :3, 3], strict=True):
             curve = bpy.data.curves.new(ids.STUDIO, "CURVE")
@@ -179,68 +181,71 @@ class Stage:
             spline.points.add(1)
             spline.points[0].co, spline.points[1].co = (*center, 1.0), (0.0, 0.0, 0.0, 1.0)
             curve.materials.append(material)
-            rays[number] = self.put(curve)
+            rays[number] = self.add_object(curve)
             rays[number].visible_shadow = False
         return rays
 
 
-def aim(camera: bpy.types.Object, direction: Points, page: Page, points: Points, top: int) -> None:
+def aim_camera(camera: bpy.types.Object, direction: Points, page: Page, points: Points, top: int) -> None:
     """Place a camera in a direction so that points (N, 3) just fit the page below row `top`, with even margins."""
     turn = (-Vector(direction)).to_track_quat("-Z", "Y")
     right, up, back = np.array(turn.to_matrix()).T
     longer, margin = max(page.width, page.height), _MARGIN * min(page.width, page.height)
-    per_pixel = _FILM / camera.data.lens / longer  # tangents of angles
-    across, above, below = (
+    per_pixel = _SENSOR_WIDTH / camera.data.lens / longer  # tangent of the angle of a pixel
+    half_width, top_edge, bottom_edge = (
         per_pixel * (half - free)
         for half, free in ((page.width / 2, margin), (page.height / 2, max(top, margin)), (page.height / 2, margin))
     )
     depth = -points @ back
     x, y = points @ right, points @ up
-    # Seen from (cx, cy) at a distance d, a point is inside where x - cx <= across (depth + d), and so on for each side.
-    x_high, x_low = np.max(x - across * depth), np.max(-x - across * depth)
-    y_high, y_low = np.max(y - above * depth), np.max(-y - below * depth)
-    distance = max((x_high + x_low) / (2 * across), (y_high + y_low) / (above + below))
-    cx, cy = (x_high - x_low) / 2, (y_high - above * distance + below * distance - y_low) / 2
-    for _ in range(10):  # into the middle, where one direction leaves room
-        seen_x, seen_y = (x - cx) / (depth + distance), (y - cy) / (depth + distance)
-        cx += distance * (seen_x.max() + seen_x.min()) / 2
-        cy += distance * (seen_y.max() - above + seen_y.min() + below) / 2
+    # Seen from (cx, cy) at a distance d, a point is inside if x - cx <= half_width (depth + d), and so on for each side.
+    x_high, x_low = np.max(x - half_width * depth), np.max(-x - half_width * depth)
+    y_high, y_low = np.max(y - top_edge * depth), np.max(-y - bottom_edge * depth)
+    distance = max((x_high + x_low) / (2 * half_width), (y_high + y_low) / (top_edge + bottom_edge))
+    cx, cy = (x_high - x_low) / 2, (y_high - top_edge * distance + bottom_edge * distance - y_low) / 2
+    for _ in range(10):  # centre the points where one direction leaves room
+        view_x, view_y = (x - cx) / (depth + distance), (y - cy) / (depth + distance)
+        cx += distance * (view_x.max() + view_x.min()) / 2
+        cy += distance * (view_y.max() - top_edge + view_y.min() + bottom_edge) / 2
     camera.location = cx * right + cy * up + distance * back
     camera.rotation_mode, camera.rotation_quaternion = "QUATERNION", turn
     camera.data.clip_start, camera.data.clip_end = 0.01 * distance, 10.0 * distance
 
 
-def _backdrop(world: bpy.types.World, paper: str) -> None:
-    """Have the camera see paper behind the scene, and metal reflect surroundings that are brighter."""
+def _set_backdrop(world: bpy.types.World, paper: str) -> None:
+    """Make the camera see paper behind the scene, and metal reflect surroundings that are brighter."""
     compat.use_nodes(world)
     tree = world.node_tree
     tree.nodes.clear()
     add_node, rgb = partial(compat.add_node, tree), bytes.fromhex(paper.removeprefix("#"))
     color = [*Color([n / 255 for n in rgb]).from_srgb_to_scene_linear(), 1.0]
     light = add_node("ShaderNodeBackground", (0, 0), {"Color": [*[_WORLD] * 3, 1.0]})
-    back = add_node("ShaderNodeBackground", (0, -150), {"Color": color})
-    seen = add_node("ShaderNodeLightPath", (0, 350)).outputs["Is Camera Ray"]
-    mixed = add_node("ShaderNodeMixShader", (250, 0), {0: seen, 1: light.outputs[0], 2: back.outputs[0]})
-    add_node("ShaderNodeOutputWorld", (450, 0), {"Surface": mixed.outputs[0]})
+    paper_light = add_node("ShaderNodeBackground", (0, -150), {"Color": color})
+    is_camera_ray = add_node("ShaderNodeLightPath", (0, 350)).outputs["Is Camera Ray"]
+    mix = add_node("ShaderNodeMixShader", (250, 0), {0: is_camera_ray, 1: light.outputs[0], 2: paper_light.outputs[0]})
+    add_node("ShaderNodeOutputWorld", (450, 0), {"Surface": mix.outputs[0]})
 
 
-def _material(part: str) -> bpy.types.Material:
-    """A copy of the material of parts: in the accent's colour by the faces' attribute "lit", and clear without "there"."""
+def _figure_material(part: str) -> bpy.types.Material:
+    """Return a copy of a part's material that follows two attributes of faces.
+
+    Attribute "lit" mixes in the accent's colour; attribute "there" is the opacity.
+    """
     material = collimators.part_material(part).copy()
     material.name, tree = ids.STUDIO, material.node_tree
     output = tree and tree.get_output_node("CYCLES")
-    if output is None or not output.inputs["Surface"].links:  # the user's own
+    if output is None or not output.inputs["Surface"].links:  # a material of the user's own
         return material
     add_node, surface = partial(compat.add_node, tree), output.inputs["Surface"]
-    lit, there = (
+    lit, opacity = (
         add_node("ShaderNodeAttribute", (600, y), attribute_name=name).outputs["Fac"]
         for name, y in (("lit", 300), ("there", 500))
     )
-    shine = {"Base Color": _ACCENT, "Roughness": 0.5, "Emission Color": _ACCENT, "Emission Strength": _SHINE}
-    bright = add_node("ShaderNodeBsdfPrincipled", (600, -200), shine).outputs[0]
-    if plain := next((node for node in tree.nodes if node.type == "BSDF_PRINCIPLED"), None):
-        plain.inputs["Metallic"].default_value *= _DULL  # of metal one would see what it reflects
-    either = add_node("ShaderNodeMixShader", (800, 0), {0: lit, 1: surface.links[0].from_socket, 2: bright}).outputs[0]
+    lit_inputs = {"Base Color": _ACCENT, "Roughness": 0.5, "Emission Color": _ACCENT, "Emission Strength": _GLOW}
+    accent = add_node("ShaderNodeBsdfPrincipled", (600, -200), lit_inputs).outputs[0]
+    if principled := next((node for node in tree.nodes if node.type == "BSDF_PRINCIPLED"), None):
+        principled.inputs["Metallic"].default_value *= _METALLIC_FACTOR  # metal would mirror the surroundings
+    tinted = add_node("ShaderNodeMixShader", (800, 0), {0: lit, 1: surface.links[0].from_socket, 2: accent}).outputs[0]
     clear = add_node("ShaderNodeBsdfTransparent", (800, 200)).outputs[0]
-    tree.links.new(add_node("ShaderNodeMixShader", (1000, 0), {0: there, 1: clear, 2: either}).outputs[0], surface)
+    tree.links.new(add_node("ShaderNodeMixShader", (1000, 0), {0: opacity, 1: clear, 2: tinted}).outputs[0], surface)
     return material

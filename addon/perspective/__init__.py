@@ -1,0 +1,7 @@
+"""Volumes as modules see them, epipolar lines of a picked pixel, and the colour bar of the 3D views.
+
+`frustums.frustum_job` shows the active volume as layers in a module's own coordinates, `frustums.resample_job` takes it
+through these and back. `epipolar.pick_pixel` picks a pixel of the shown run; `epipolar_drawing.py` draws its ray and lines.
+
+A property of frustums is a row of `PerspectiveSettings`; the conditions that make one outdated are in `frustums.changes`.
+"""

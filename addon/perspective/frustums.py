@@ -1,8 +1,8 @@
-"""Volumes as a module sees them, in its own coordinates: a frustum of pictures in the scene, or back on their own voxels.
+"""Volumes in a module's own coordinates: as a frustum of pictures in the scene, or back on their own voxels.
 
 A frustum is a mesh of lines, a child of its module's camera, and an image empty for each layer of depth, its children, in a
-collection of their own. Layers are as far from the pinhole, and as large, as what they show: seen from the pinhole, they
-lie on one another. They go with the module; what they show was true when they were made, and `changes` says what is not.
+collection of their own. Layers have the distance from the pinhole, and the size, of the part that they show: seen from the
+pinhole, they lie on one another. They move with the module; `changes` tells whether they still show the present scene.
 """
 
 import json
@@ -29,291 +29,295 @@ from ..runs import runs
 from ..scanner import scanner, selection
 from ..volumes import slices, stored_volumes, volume_materials, volumes
 
-_KEY = "mphdrr_frustum"  # custom property of the lines: what the frustum was made of, JSON
-_NEAREST = 0.1  # of the pinhole's distance from the isocentre: where layers begin at the nearest
-_BYTES = 24.0  # a pixel of a layer: its number, its colours and Blender's copies
-_PNG_LEVEL = 1  # fast
-_OPACITY_POWER = 0.5  # of the relative value: layers are thick, and what is thin in them would hardly be seen
+_KEY = "mphdrr_frustum"  # custom property of the lines: the state of volume and module that the frustum shows, JSON
+_NEAREST = 0.1  # smallest depth of layers, relative to the pinhole's distance from the isocentre
+_BYTES_PER_PIXEL = 24.0  # of a layer: number, colours and Blender's copies
+_PNG_LEVEL = 1  # fast compression
+_OPACITY_POWER = 0.5  # opacity = relative value ** this power: thin structures in a thick layer would be too faint
 
 Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
 class _Request:
-    """What is asked for: a volume in a module's coordinates."""
+    """Everything that a worker thread needs to put a volume into a module's coordinates."""
 
-    item: int  # session_uid of the volume's object
-    camera: int  # and of the module's camera
-    name: str
-    module: str
-    read: Callable[[], Volume]
-    views: Views  # of this module alone
-    nearest: float  # depth, mm, at which cells may begin
-    state: dict[str, Any]
+    item: int  # `session_uid` of the volume's object
+    camera: int  # `session_uid` of the module's camera
+    name: str  # name of the volume's object
+    module: str  # name of the module's camera
+    read: Callable[[], Volume]  # reader of the volume's voxels
+    views: Views  # view of this module alone
+    nearest: float  # smallest depth of cells, mm
+    state: dict[str, Any]  # state that the frustum will show (`_frustum_state`)
 
 
-def showing(context: bpy.types.Context, planes: int, uniform: str) -> jobs.Job:
-    """The job that shows the active volume as a frustum of the active module, in place of the one that it has.
+def frustum_job(context: bpy.types.Context, planes: int, uniform: str) -> jobs.Job:
+    """Return the job that shows the active volume as a frustum of the active module, in place of the module's present one.
 
     Raises InputError where there is no volume or module, the volume is not in front of the pinhole, or memory does not
     suffice.
     """
-    asked = _request(context)
+    request = _read_request(context)
     low, high = _display_range(context.object)
-    quantity, scene_uid = asked.state["quantity"], context.scene.session_uid
-    rows, columns = asked.views.shape
-    memory.require(_BYTES * planes * rows * columns, f"{planes} pictures of {columns} x {rows} pixels")
+    quantity, scene_uid = request.state["quantity"], context.scene.session_uid
+    rows, columns = request.views.shape
+    memory.require(_BYTES_PER_PIXEL * planes * rows * columns, f"{planes} pictures of {columns} x {rows} pixels")
 
     def work(progress: Progress) -> tuple[PerspectiveGrid, list[bytes]]:
         stages = stages_of(progress)
-        _, g, array = _followed(asked, planes, uniform, stages)
+        _, g, array = _resample_to_frustum(request, planes, uniform, stages)
         packing, files = stages("packing"), list[bytes]()
         for layer in np.moveaxis(array, 2, 0):
-            files.append(png(colored(as_seen(layer.T), quantity, low, high), _PNG_LEVEL))
+            files.append(png(color_values(as_seen(layer.T), quantity, low, high), _PNG_LEVEL))
             tell(packing, len(files), planes)
         return g, files
 
-    def finish(made: tuple[PerspectiveGrid, list[bytes]]) -> str:
-        scene, camera = jobs.found_again(bpy.data.scenes, scene_uid), jobs.found_again(bpy.data.objects, asked.camera)
+    def finish(result: tuple[PerspectiveGrid, list[bytes]]) -> str:
+        scene, camera = jobs.find_by_uid(bpy.data.scenes, scene_uid), jobs.find_by_uid(bpy.data.objects, request.camera)
         if scene is None or camera is None:
-            raise InputError(f"{asked.module} is gone")
-        g, files = made
+            raise InputError(f"{request.module} is gone")
+        g, files = result
         remove(scene, [camera])
-        _build(scene, camera, asked, g, files)
+        _add_frustum(scene, camera, request, g, files)
         near, far = g.depths[[0, -1]]
         words = f"{near:.4g} to {far:.4g} mm" if planes > 1 else f"{near:.4g} mm"
-        return f"{asked.name!r} as {asked.module} sees it: {planes} layers, {words} from the pinhole"
+        return f"{request.name!r} as {request.module} sees it: {planes} layers, {words} from the pinhole"
 
-    return jobs.Job(f"{asked.name} in perspective", work, finish)
+    return jobs.Job(f"{request.name} in perspective", work, finish)
 
 
-def resampling(context: bpy.types.Context, cells: int, uniform: str) -> jobs.Job:
-    """The job that takes the active volume through the cells of the active module and back, as a new volume of the scene.
+def resample_job(context: bpy.types.Context, cells: int, uniform: str) -> jobs.Job:
+    """Return the job that resamples the active volume onto the active module's cells and back, as a new volume of the scene.
 
-    Raises InputError as `showing`.
+    Raises InputError as `frustum_job`.
     """
-    asked, shown = _request(context), _shown_range(context.object)
-    rows, columns = asked.views.shape
+    request, display_range = _read_request(context), _typed_range(context.object)
+    rows, columns = request.views.shape
     voxels = float(np.prod(context.object.mphdrr_volume.shape))
     memory.require(8.0 * cells * rows * columns + 8.0 * voxels, f"{columns} x {rows} x {cells} cells")
-    provenance = {"volume": asked.name, "through": asked.module, "cells": [columns, rows, cells], "evenly_in": uniform}
+    shape = [columns, rows, cells]
+    provenance = {"volume": request.name, "through": request.module, "cells": shape, "evenly_in": uniform}
 
     def make(progress: Progress) -> Volume:
         stages = stages_of(progress)
-        volume, g, array = _followed(asked, cells, uniform, stages)
-        return on_voxels(array, g, volume, stages("back on voxels"))
+        volume, g, array = _resample_to_frustum(request, cells, uniform, stages)
+        return to_voxels(array, g, volume, stages("back on voxels"))
 
     def finish(item: bpy.types.Object, stored: stored_volumes.StoredVolume) -> str:
-        item.mphdrr_volume.display_low, item.mphdrr_volume.display_high = shown
+        item.mphdrr_volume.display_low, item.mphdrr_volume.display_high = display_range
         return f"Added {item.name!r}: {volumes.values_text(stored)}"
 
-    name, pose = f"{asked.name} through {asked.module}", volumes.pose_of_object(context.object)
-    return volumes.adding(name, make, name, finish, pose, provenance, context.object.users_collection[0])
+    name, pose = f"{request.name} through {request.module}", volumes.pose_of_object(context.object)
+    return volumes.add_volume_job(name, make, name, finish, pose, provenance, context.object.users_collection[0])
 
 
-def _followed(
-    asked: _Request, layers: int, uniform: str, stages: Stages
+def _resample_to_frustum(
+    request: _Request, layers: int, uniform: str, stages: Stages
 ) -> tuple[Volume, PerspectiveGrid, NDArray[np.float32]]:
-    """The volume, the module's cells, and what these see of it."""
+    """Read the volume and resample it onto the module's grid; return volume, grid and values (n_u, n_v, layers)."""
     stages("reading the voxels")
-    volume = asked.read()
-    g = _grid(asked, volume, layers, uniform)
-    return volume, g, in_perspective(volume, g, stages("following the rays"))
+    volume = request.read()
+    g = _perspective_grid(request, volume, layers, uniform)
+    return volume, g, to_module_cells(volume, g, stages("following the rays"))
 
 
-def in_perspective(volume: Volume, g: PerspectiveGrid, progress: Progress | None = None) -> NDArray[np.float32]:
-    """`to_perspective`, keeping density, of a volume of any quantity; outside its grid CT numbers are those of air."""
+def to_module_cells(volume: Volume, g: PerspectiveGrid, progress: Progress | None = None) -> NDArray[np.float32]:
+    """Return a volume's values in a module's cells by `to_perspective`; outside the volume, CT numbers are those of air."""
     outside = outside_value(volume)
     array = volume.array - np.float32(outside) if outside else volume.array
-    found = np.asarray(to_perspective(array, g, grid=volume.grid, progress=progress))
-    return found + np.float32(outside) if outside else found
+    values = np.asarray(to_perspective(array, g, grid=volume.grid, progress=progress))
+    return values + np.float32(outside) if outside else values
 
 
-def on_voxels(array: NDArray[np.float32], g: PerspectiveGrid, like: Volume, progress: Progress | None = None) -> Volume:
-    """The way back from `in_perspective`: `from_perspective`, keeping density, on the voxels of `like`."""
+def to_voxels(array: NDArray[np.float32], g: PerspectiveGrid, like: Volume, progress: Progress | None = None) -> Volume:
+    """Return values in a module's cells on the voxels of `like`, by `from_perspective`."""
     outside = np.float32(outside_value(like))
-    found = np.asarray(from_perspective(array - outside, g, like.grid, progress=progress))
-    return Volume(found + outside, like.grid, like.quantity)
+    values = np.asarray(from_perspective(array - outside, g, like.grid, progress=progress))
+    return Volume(values + outside, like.grid, like.quantity)
 
 
-def colored(values: NDArray[np.float32], quantity: str, low: float, high: float) -> NDArray[np.uint8]:
-    """Colours (…, 4) of values, those of slices; the lower a value in the display range, the more transparent."""
+def color_values(values: NDArray[np.float32], quantity: str, low: float, high: float) -> NDArray[np.uint8]:
+    """Return the colours (…, 4) of values as slices have them, and an opacity that rises with the value."""
     relative = np.clip((values - low) / max(high - low, 1e-30), 0.0, 1.0)
-    colors = np.rint(255 * slices.colors(quantity)[:, :3]).astype(np.uint8)
-    shown = np.empty((*values.shape, 4), np.uint8)
-    shown[..., :3] = colors[np.rint(relative * (len(colors) - 1)).astype(np.intp)]
-    shown[..., 3] = np.rint(255 * relative**_OPACITY_POWER)
-    return shown
+    colors = np.rint(255 * slices.color_table(quantity)[:, :3]).astype(np.uint8)
+    result = np.empty((*values.shape, 4), np.uint8)
+    result[..., :3] = colors[np.rint(relative * (len(colors) - 1)).astype(np.intp)]
+    result[..., 3] = np.rint(255 * relative**_OPACITY_POWER)
+    return result
 
 
 def frustums(scene: bpy.types.Scene) -> list[bpy.types.Object]:
-    """The frustums in the scene: their lines, which have the layers as children."""
-    homes = objects.homes(scene, ids.PERSPECTIVES)
-    return sorted((o for home in homes for o in home.objects if _KEY in o), key=lambda o: o.name)
+    """Return the frustums in the scene: their line objects, whose children are the layers."""
+    collections = objects.collections_named(scene, ids.PERSPECTIVES)
+    return sorted((o for collection in collections for o in collection.objects if _KEY in o), key=lambda o: o.name)
 
 
 def layers(frustum: bpy.types.Object) -> list[bpy.types.Object]:
-    """A frustum's layers, from the pinhole outwards."""
+    """Return a frustum's layers, from the pinhole outwards."""
     return sorted(frustum.children, key=lambda layer: layer.name)
 
 
-def volume_of(frustum: bpy.types.Object) -> str:
-    """The name that the volume had of which a frustum was made."""
+def volume_name(frustum: bpy.types.Object) -> str:
+    """Return the name that a frustum's volume had when the frustum was made."""
     return str(json.loads(frustum[_KEY])["volume"])
 
 
 def changes(scene: bpy.types.Scene, frustum: bpy.types.Object) -> str:
-    """What is not any more as it was when a frustum was made, in words; "" where all is."""
-    was, camera = json.loads(frustum[_KEY]), frustum.parent
+    """Return in words what differs between a frustum and the present scene; "" for no difference."""
+    old, camera = json.loads(frustum[_KEY]), frustum.parent
     if camera is None:
         return "its module is gone"
-    item = scene.objects.get(was["volume"])
+    item = scene.objects.get(old["volume"])
     if not volumes.is_volume(item):
-        return f"{was['volume']} is gone"
+        return f"{old['volume']} is gone"
     try:
-        now = _state(scene, item, camera)
+        current = _frustum_state(scene, item, camera)
     except InputError as error:
         return str(error)
     words = {"voxels": "voxels", "pose": "place", "colors": "colours"}
-    found = [text for key, text in words.items() if now[key] != was[key]]
-    text = [f"other {' and '.join(found)} of {was['volume']}"] if found else []
-    if now["views"] != was["views"]:
+    changed = [text for key, text in words.items() if current[key] != old[key]]
+    text = [f"other {' and '.join(changed)} of {old['volume']}"] if changed else []
+    if current["views"] != old["views"]:
         text.append(f"{camera.name} has moved, or has other pixels")
     return "; ".join(text)
 
 
-def seen_volumes(scene: bpy.types.Scene) -> list[bpy.types.Object]:
-    """The volumes of frustums that are seen, where these have the colours that the volumes have now."""
-    found = []
+def visible_volumes(scene: bpy.types.Scene) -> list[bpy.types.Object]:
+    """Return the volumes of visible frustums whose display range has not changed."""
+    result = []
     for frustum in frustums(scene):
-        was, item = json.loads(frustum[_KEY]), scene.objects.get(volume_of(frustum))
-        if frustum.visible_get() and volumes.is_volume(item) and was["colors"] == list(_shown_range(item)):
-            found.append(item)
-    return found
+        old, item = json.loads(frustum[_KEY]), scene.objects.get(volume_name(frustum))
+        if frustum.visible_get() and volumes.is_volume(item) and old["colors"] == list(_typed_range(item)):
+            result.append(item)
+    return result
 
 
 def remove(scene: bpy.types.Scene, modules: list[bpy.types.Object] | None = None) -> int:
-    """Remove the frustums of modules (their cameras), or of all, with what belongs to them; returns how many."""
-    found = [frustum for frustum in frustums(scene) if modules is None or frustum.parent in modules]
-    for frustum in found:
+    """Remove the frustums of modules, given as cameras, or of all, with their layers, and return how many."""
+    removed = [frustum for frustum in frustums(scene) if modules is None or frustum.parent in modules]
+    for frustum in removed:
         objects.remove_objects([*frustum.children, frustum])
-    objects.remove_empty_homes(scene, ids.PERSPECTIVES)
-    return len(found)
+    objects.remove_empty_collections(scene, ids.PERSPECTIVES)
+    return len(removed)
 
 
 def after_update(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None:
-    """Modules were shown, hidden or deleted: their frustums, too."""
+    """Show, hide frustums with their modules, and hide those whose module was deleted."""
     if not depsgraph.id_type_updated("SCENE") or scene != bpy.context.scene:
         return
     for frustum in frustums(scene):
-        hidden = frustum.parent is None or frustum.parent.hide_viewport
+        is_hidden = frustum.parent is None or frustum.parent.hide_viewport
         for item in (frustum, *frustum.children):
-            objects.change(item, hide_viewport=hidden)
+            objects.change(item, hide_viewport=is_hidden)
 
 
-def _request(context: bpy.types.Context) -> _Request:
+def _read_request(context: bpy.types.Context) -> _Request:
+    """Return the request for the active volume and module; raise `InputError` where one is missing."""
     item, camera = context.object, selection.active_module(context)
     volumes.require_volume(item)
     if camera is None:
         raise InputError("no module is active: select its camera, or choose it in the Modules panel")
     phantoms.require_current(item)
-    views, read = _views(context.scene, camera), volumes.reader(item)
+    views, read = _module_views(context.scene, camera), volumes.reader(item)
     nearest = _NEAREST * float(np.linalg.norm(views.sources[0]))
-    state = _state(context.scene, item, camera)
+    state = _frustum_state(context.scene, item, camera)
     return _Request(item.session_uid, camera.session_uid, item.name, camera.name, read, views, nearest, state)
 
 
-def _views(scene: bpy.types.Scene, camera: bpy.types.Object) -> Views:
-    """The view of one module, with the pixels that the Projections panel asks for."""
+def _module_views(scene: bpy.types.Scene, camera: bpy.types.Object) -> Views:
+    """Return the view of one module, with the pixels of the Projections panel."""
     collection = scanner.scanner_of(scene, camera)
     if collection is None:
         raise InputError(f"{camera.name!r} is in no scanner of the scene")
     return recipe_views(runs.panel_recipe(scene), scanner.read_module(collection, camera))
 
 
-def _state(scene: bpy.types.Scene, item: bpy.types.Object, camera: bpy.types.Object) -> dict[str, Any]:
-    """What a frustum shows, as JSON holds it."""
-    path, pose = volumes.source(item)
-    views = _views(scene, camera)
+def _frustum_state(scene: bpy.types.Scene, item: bpy.types.Object, camera: bpy.types.Object) -> dict[str, Any]:
+    """Return the state of volume and module that a frustum shows, as JSON holds it."""
+    path, pose = volumes.file_and_pose(item)
+    views = _module_views(scene, camera)
     arrays = views.sources, views.detector_centers, views.u_steps, views.v_steps
     return {
         "volume": item.name, "quantity": volumes.quantity_of(item), "voxels": Path(path).name, "pose": pose.tolist(),
-        "colors": list(_shown_range(item)),
+        "colors": list(_typed_range(item)),
         "views": [list(views.shape), *(array[0].tolist() for array in arrays)],
     }  # fmt: skip
 
 
-def _shown_range(item: bpy.types.Object) -> tuple[float, float]:
+def _typed_range(item: bpy.types.Object) -> tuple[float, float]:
+    """Return the display range of a volume, in the window's unit."""
     return item.mphdrr_volume.display_low, item.mphdrr_volume.display_high
 
 
 def _display_range(item: bpy.types.Object) -> tuple[float, float]:
-    """The values, in the voxels' own unit, that have the first and the last colour."""
-    factor = volume_materials.shown_unit(volumes.quantity_of(item))[1]
-    low, high = _shown_range(item)
+    """Return the display range of a volume, in the voxels' own unit."""
+    factor = volume_materials.display_unit(volumes.quantity_of(item))[1]
+    low, high = _typed_range(item)
     return low / factor, high / factor
 
 
-def _grid(asked: _Request, volume: Volume, layers: int, uniform: str) -> PerspectiveGrid:
-    """The module's cells from where the volume begins, or at least is not too close to the pinhole, to where it ends."""
-    begin, end = _depths(asked.views, volume)
-    near = max(begin, asked.nearest)
+def _perspective_grid(request: _Request, volume: Volume, layers: int, uniform: str) -> PerspectiveGrid:
+    """Return the module's cells between the depths of the volume, but not too close to the pinhole."""
+    begin, end = _depth_range(request.views, volume)
+    near = max(begin, request.nearest)
     if not near < end:
-        raise InputError(f"{asked.name!r} is not in front of the pinhole of {asked.module}")
-    return PerspectiveGrid(asked.views, 0, layers, near, end, uniform.lower())
+        raise InputError(f"{request.name!r} is not in front of the pinhole of {request.module}")
+    return PerspectiveGrid(request.views, 0, layers, near, end, uniform.lower())
 
 
-def _depths(views: Views, volume: Volume) -> tuple[float, float]:
-    """Between which depths a volume's voxels are that are not empty, or all of them if none is; mm."""
+def _depth_range(views: Views, volume: Volume) -> tuple[float, float]:
+    """Return the smallest and the largest depth, mm, of a volume's non-empty voxels, or of all if all are empty."""
     normal = np.cross(views.u_steps[0], views.v_steps[0])
     normal *= np.sign(normal @ (views.detector_centers[0] - views.sources[0])) / np.linalg.norm(normal)
-    per_step, grid = normal @ volume.grid.affine[:3, :3], volume.grid
-    filled = volume.array != outside_value(volume)
-    if not filled.any():
-        filled = np.ones(grid.shape, bool)
-    across = per_step[1] * np.arange(grid.shape[1])[:, None] + per_step[2] * np.arange(grid.shape[2])
-    planes = ((n, across[plane]) for n, plane in enumerate(filled) if plane.any())  # one by one, in little memory
-    ends = np.array([[n * per_step[0] + found.min(), n * per_step[0] + found.max()] for n, found in planes])
+    steps, grid = normal @ volume.grid.affine[:3, :3], volume.grid
+    is_filled = volume.array != outside_value(volume)
+    if not is_filled.any():
+        is_filled = np.ones(grid.shape, bool)
+    offsets = steps[1] * np.arange(grid.shape[1])[:, None] + steps[2] * np.arange(grid.shape[2])
+    planes = ((n, offsets[plane]) for n, plane in enumerate(is_filled) if plane.any())  # one at a time, to save memory
+    ends = np.array([[n * steps[0] + plane.min(), n * steps[0] + plane.max()] for n, plane in planes])
     first = float(normal @ (grid.affine[:3, 3] - views.sources[0]))
-    half = 0.5 * float(np.abs(per_step).sum())
-    return first + float(ends.min()) - half, first + float(ends.max()) + half
+    half_voxel = 0.5 * float(np.abs(steps).sum())
+    return first + float(ends.min()) - half_voxel, first + float(ends.max()) + half_voxel
 
 
-def _build(
-    scene: bpy.types.Scene, camera: bpy.types.Object, asked: _Request, g: PerspectiveGrid, files: list[bytes]
+def _add_frustum(
+    scene: bpy.types.Scene, camera: bpy.types.Object, request: _Request, g: PerspectiveGrid, files: list[bytes]
 ) -> None:
-    """Put a frustum into the scene: lines around the layers and from the pinhole, and a picture for each layer."""
-    home = objects.home(scene, ids.PERSPECTIVES)
+    """Add a frustum to the scene: lines around the layers and from the pinhole, and a picture for each layer."""
+    collection = objects.ensure_collection(scene, ids.PERSPECTIVES)
     to_camera = np.linalg.inv(objects.world_matrix(camera))
     corners = _corners(g) @ to_camera[:3, :3].T + to_camera[:3, 3]  # (n_k, 4, 3)
     name = ids.part_name(camera.name, "perspective")
-    frustum = bpy.data.objects.new(name, _lines(name, corners))
-    frustum[_KEY] = json.dumps(asked.state)
+    frustum = bpy.data.objects.new(name, _line_mesh(name, corners))
+    frustum[_KEY] = json.dumps(request.state)
     frustum.parent, frustum.hide_select, frustum.hide_render = camera, True, True
     frustum.lock_location = frustum.lock_rotation = frustum.lock_scale = (True, True, True)
-    home.objects.link(frustum)
+    collection.objects.link(frustum)
     n_v, n_u = g.views.shape
     digits = len(str(len(files)))
     for n, (file, (origin, along_u, _, along_v)) in enumerate(zip(files, corners, strict=True), start=1):
         text = f"{name} layer {n:0{digits}d}"
-        picture = images.filled(bpy.data.images.new(text, 1, 1, alpha=True), file)
+        picture = images.fill(bpy.data.images.new(text, 1, 1, alpha=True), file)
         layer = objects.picture_empty(text, frustum, picture, "DOUBLE_SIDED")
         layer.empty_display_size = max(n_u, n_v)
-        across, up = origin - along_u, along_v - origin  # a picture's columns go against u, as the pinhole sees it
+        across, up = origin - along_u, along_v - origin  # a picture's columns run along -u, as the pinhole sees it
         normal = np.cross(across, up) / np.linalg.norm(np.cross(across, up))
         matrix = affine_matrix(np.column_stack([across / n_u, up / n_v, normal]), (along_u + along_v) / 2)
         layer.hide_select, layer.matrix_basis = True, Matrix(matrix)
-        home.objects.link(layer)
+        collection.objects.link(layer)
 
 
 def _corners(g: PerspectiveGrid) -> Floats:
-    """World points (n_k, 4, 3), mm, around the layers' outermost pixels: from (0, 0) along u, then along v."""
+    """Return the corners (n_k, 4, 3), world mm, of the layers' outermost pixels: from (0, 0) along u, then along v."""
     n_u, n_v, _ = g.shape
     pixels = np.array([[0, 0], [n_u, 0], [n_u, n_v], [0, n_v]]) - 0.5
     return g.to_world([[[*pixel, plane] for pixel in pixels] for plane in g.planes])
 
 
-def _lines(name: str, corners: Floats) -> bpy.types.Mesh:
+def _line_mesh(name: str, corners: Floats) -> bpy.types.Mesh:
+    """Return a mesh of lines around the layers' `corners` (n_k, 4, 3), and from the pinhole to the last ones."""
     points = [[0.0, 0.0, 0.0], *corners.reshape(-1, 3).tolist()]
     around = [(4 * n + a, 4 * n + a % 4 + 1) for n in range(len(corners)) for a in range(1, 5)]
     last = 4 * len(corners)

@@ -1,4 +1,4 @@
-"""Phantoms follow their settings: small ones at once, others, in a window, once the settings rest; large ones on Update."""
+"""Phantoms follow their settings: small ones at once, larger ones in a window after a pause, the largest at Update."""
 
 import bpy
 
@@ -8,43 +8,43 @@ from ..blender import jobs, timers, windows
 from . import phantoms
 
 QUICK_VOXELS = 64**3
-"""Up to so many voxels, of all its states, a phantom is made again at every edit."""
+"""Largest number of voxels, of all states, with which a phantom is voxelized again at every edit."""
 RESTED_VOXELS = 128**3
-"""Up to so many it is made again by a job when its settings rest."""
-_REST = 0.5  # s without an edit
-_edited = ""  # name of the phantom that `_rested` is about
+"""Largest number of voxels with which a job voxelizes a phantom again once its settings rest."""
+_PAUSE = 0.5  # s without an edit, after which settings are taken to rest
+_edited_name = ""  # name of the phantom that was edited last
 
 
 def settings_changed(item: bpy.types.ID) -> None:
-    """A phantom's setting was edited: make its voxels again, or mark them as outdated and say what is wrong."""
-    global _edited
+    """Voxelize a phantom again after an edit of its settings, or mark its voxels as outdated and note what is wrong."""
+    global _edited_name
     settings = phantoms.settings_of(item) if isinstance(item, bpy.types.Object) else None
-    if settings is None:  # it is being added
+    if settings is None:  # the phantom is being added
         return
     properties = item.mphdrr_volume
     properties.outdated, properties.message = True, ""
-    with recorded_warnings() as caught:
+    with recorded_warnings() as warnings:
         try:
-            make = phantoms.remaking(item)
+            voxelize = phantoms.make_voxelizer(item)
             if settings.n_voxels <= QUICK_VOXELS and not jobs.is_running():
-                phantoms.replace(item, make(None))
+                phantoms.replace_voxels(item, voxelize(None))
             else:
                 phantoms.update_outline(item)
         except InputError as error:
             properties.message = str(error)
             return
-    properties.message = next(iter(caught), "")
+    properties.message = next(iter(warnings), "")
     if properties.outdated and settings.n_voxels <= RESTED_VOXELS and windows.has_window():
-        _edited = item.name
-        timers.forget(_rested)
-        timers.soon(_rested, _REST)
+        _edited_name = item.name
+        timers.cancel(_update_edited)
+        timers.schedule(_update_edited, _PAUSE)
 
 
-def _rested() -> float | None:
-    """Press Update Phantom for the phantom that was edited last; later, if a job is running."""
+def _update_edited() -> float | None:
+    """Press Update Phantom for the phantom that was edited last; wait if a job is running."""
     if jobs.is_running() or bpy.app.is_job_running("RENDER"):
-        return _REST
-    item = bpy.data.objects.get(_edited)
+        return _PAUSE
+    item = bpy.data.objects.get(_edited_name)
     if item is not None and phantoms.settings_of(item) is not None and item.mphdrr_volume.outdated:
         window = bpy.context.window_manager.windows[0]
         with bpy.context.temp_override(window=window, object=item):

@@ -1,4 +1,4 @@
-"""Phantoms in the scene: volumes that know what they were made from, and are made again when that changes.
+"""Phantoms in the scene: volumes that keep their settings and are voxelized again when these change.
 
 The object's matrix is the phantom's pose. The voxels are in its own frame, so that moving the object moves the phantom. A
 phantom may have children that go with it: a volume of its other quantity, and an outline.
@@ -23,20 +23,20 @@ from ...core.progress import Progress, part_of, stages_of
 from ..blender import jobs, objects, storage
 from ..blender.reports import Need
 from ..volumes import meshes, vdb, volumes
-from ..volumes.stored_volumes import StoredVolume, moved, store_volume
+from ..volumes.stored_volumes import StoredVolume, move_grid, store_volume
 from .phantom_properties import FILE, PhantomSettings
 
 _OUTLINE = "mphdrr_outline"  # custom property of an outline's object
 
 
 @dataclass(frozen=True)
-class Recipe:
-    """What a phantom's settings say, for a thread that leaves bpy alone."""
+class PhantomJob:
+    """A phantom's settings copied out of Blender, so that a worker thread can voxelize it."""
 
-    phantom: Phantom  # of one that beats, the first state
-    n_states: int  # one for each frame
-    grid: Grid  # its voxels, in its own frame
-    settings: dict[str, Any]  # as JSON can hold them
+    phantom: Phantom  # the phantom, a beating one in its first state
+    n_states: int  # number of states, one for each frame
+    grid: Grid  # grid of the voxels, in the phantom's frame
+    settings: dict[str, Any]  # settings that JSON can hold
 
     @cached_property
     def states(self) -> Sequence[Phantom]:
@@ -52,9 +52,9 @@ class Recipe:
         progress: Progress | None = None,
         baked: bool = False,
     ) -> list[StoredVolume]:
-        """A volume of each quantity, stored in `folder`, its phantom at a world-from-phantom pose (4, 4), mm.
+        """Voxelize the phantom for each quantity at its world-from-phantom pose (4, 4), mm, and store the volumes.
 
-        Its grid turns with the phantom or, if `baked`, its grid and its object are along the world's axes.
+        The grid turns with the phantom or, if `baked`, grid and object are along the world's axes.
         """
         title, count = self.phantom.title, len(quantities) * self.n_states
         for quantity in quantities:
@@ -69,33 +69,33 @@ class Recipe:
         stored = []
         for quantity, pose in zip(quantities, poses, strict=True):
             if baked:
-                place = affine_matrix(np.eye(3), pose[:3, 3])
-                # A grid along the world's axes that holds the phantom, with voxels as small as its own.
+                object_pose = affine_matrix(np.eye(3), pose[:3, 3])
+                # The grid along the world's axes holds the whole phantom, with voxels as small as the phantom's own.
                 corners = list(itertools.product(*zip(*self.phantom.box, strict=True))) @ pose[:3, :3].T + pose[:3, 3]
                 grid = grid_around(corners, min(Grid(self.grid.shape, pose @ self.grid.affine).spacing))
-                made = [phantom.voxelize(grid, pose, next(reports), quantity) for phantom in self.states]
+                states = [phantom.voxelize(grid, pose, next(reports), quantity) for phantom in self.states]
                 settings = self.settings | {"pose": pose.tolist()}
             else:
-                place, settings = pose, self.settings
-                own = [phantom.voxelize(self.grid, None, next(reports), quantity) for phantom in self.states]
-                made = [moved(volume, pose) for volume in own]
+                object_pose, settings = pose, self.settings
+                local_states = [phantom.voxelize(self.grid, None, next(reports), quantity) for phantom in self.states]
+                states = [move_grid(volume, pose) for volume in local_states]
             stages("writing the voxels")
-            stored.append(store_volume(made, folder, place, settings))
+            stored.append(store_volume(states, folder, object_pose, settings))
         return stored
 
 
-def recipe_of(settings: PhantomSettings) -> Recipe:
-    """What settings say; raises `InputError` where there is no such phantom."""
+def copy_settings(settings: PhantomSettings) -> PhantomJob:
+    """Return a copy of a phantom's settings for a worker thread; raise `InputError` where there is no such phantom."""
     phantom = settings.phantom()
-    return Recipe(phantom, settings.n_states, settings.grid(phantom), settings.recipe())
+    return PhantomJob(phantom, settings.n_states, settings.grid(phantom), settings.recipe())
 
 
 def settings_of(item: bpy.types.Object | None) -> Any:
-    """The settings that a volume was made from as a phantom; None where it is none."""
+    """Return the settings from which a volume was made as a phantom; None where it is no phantom."""
     if item is None or not volumes.is_volume(item):
         return None
     properties = item.mphdrr_volume
-    # A kind that only a later version knows is "": its voxels stay as they are.
+    # Blender reads a kind of a later version as "": the voxels of such a phantom stay as they are.
     return None if properties.kind in ("VOLUME", "") else getattr(properties, properties.kind.lower())
 
 
@@ -105,65 +105,68 @@ ACTIVE: Need = (
 )
 
 
-def adding(
+def add_phantom_job(
     settings: PhantomSettings, name: str, pose: NDArray[np.float64] | None = None, attenuation: bool = False
 ) -> jobs.Job:
-    """The job that adds a phantom to the scene, of an operator's settings or `phantom_properties.plain_settings`.
+    """Return the job that adds a phantom to the scene, of an operator's settings or `phantom_properties.plain_settings`.
 
-    The `pose` is its world-from-phantom matrix (4, 4), mm, by default the world's axes. With `attenuation`, the mu of a
-    phantom of activity is added too, as a child.
+    The `pose` is its world-from-phantom matrix (4, 4), mm, by default the identity. With `attenuation`, the mu of a phantom
+    of activity is added too, as a child.
     """
-    recipe, folder, values = recipe_of(settings), storage.folder(), settings.values()
+    phantom_job, folder, values = copy_settings(settings), storage.folder(), settings.values()
     kind, quantity = settings.identifier, values["quantity"]
     quantities = ["activity", "mu"] if attenuation and quantity == "activity" else [quantity]
     poses = [np.eye(4) if pose is None else pose] * len(quantities)
 
     def work(progress: Progress) -> list[StoredVolume]:
-        return recipe.voxelize(quantities, poses, folder, progress)
+        return phantom_job.voxelize(quantities, poses, folder, progress)
 
     def finish(stored: list[StoredVolume]) -> str:
         if kind == FILE and "text" not in values:
-            values["text"] = bpy.data.texts.new(recipe.settings["file"])
-            values["text"].from_string(recipe.settings["text"])
+            values["text"] = bpy.data.texts.new(phantom_job.settings["file"])
+            values["text"].from_string(phantom_job.settings["text"])
         collection = bpy.context.collection
         item = volumes.add_stored(stored[0], name, collection)
-        take_settings(item, kind, values)
-        for other in stored[1:]:
-            child = volumes.add_stored(other, f"{item.name} {other.volume.quantity}", collection)
+        store_settings(item, kind, values)
+        for stored_child in stored[1:]:
+            child = volumes.add_stored(stored_child, f"{item.name} {stored_child.volume.quantity}", collection)
             child.mphdrr_volume.with_parent = True
             child.parent = item
             child.matrix_basis.identity()
         volumes.make_active(bpy.context, item)
-        grid = recipe.grid
+        grid = phantom_job.grid
         return f"Added {item.name!r}: {grid.shape[0]}^3 voxels of {grid.spacing[0]:.3g} mm"
 
     return jobs.Job("Making a phantom", work, finish)
 
 
-def take_settings(item: bpy.types.Object, kind: str, values: Mapping[str, Any]) -> None:
-    """Say that a volume is the phantom of a kind (`PhantomSettings.identifier`) with these settings; its voxels stay."""
+adding = add_phantom_job  # the name in version 0.2.0, for scripts
+
+
+def store_settings(item: bpy.types.Object, kind: str, values: Mapping[str, Any]) -> None:
+    """Make a volume the phantom of a kind (`PhantomSettings.identifier`) with these settings; its voxels stay."""
     properties = item.mphdrr_volume
-    properties.kind = "VOLUME"  # until the kind is set, no change of a setting makes the voxels again
+    properties.kind = "VOLUME"  # prevents that a change of a setting voxelizes again before all are set
     for key, value in values.items():
         setattr(getattr(properties, kind), key, value)
     properties.kind = kind.upper()
     properties.outdated, properties.message = False, ""
 
 
-def updating(item: bpy.types.Object, bake: bool = False) -> jobs.Job:
-    """The job that makes a phantom's voxels, and its children's, again from its settings.
+def update_phantom_job(item: bpy.types.Object, bake: bool = False) -> jobs.Job:
+    """Return the job that voxelizes a phantom and its children again from the phantom's settings.
 
-    With `bake`, at its pose and on a grid along the world's axes; then it is a phantom no more, but a volume like any other.
+    With `bake`, the new grid is along the world's axes at the phantom's pose, and the phantom becomes an ordinary volume.
     """
-    work, name, before = remaking(item, bake), item.name, settings_of(item).values()
+    work, name, old_settings = make_voxelizer(item, bake), item.name, settings_of(item).values()
 
     def finish(stored: list[StoredVolume]) -> str:
         item = bpy.data.objects.get(name)
         settings = settings_of(item)
         if item is None or settings is None:
             raise InputError(f"the phantom {name!r} is gone")
-        has_changed = settings.values() != before
-        replace(item, stored, bake)
+        has_changed = settings.values() != old_settings
+        replace_voxels(item, stored, bake)
         if bake:
             return f"Applied the pose of {name!r}"
         item.mphdrr_volume.outdated = has_changed
@@ -172,23 +175,23 @@ def updating(item: bpy.types.Object, bake: bool = False) -> jobs.Job:
     return jobs.Job("Making a phantom", work, finish)
 
 
-def remaking(item: bpy.types.Object, bake: bool = False) -> Callable[[Progress | None], list[StoredVolume]]:
-    """The work of `updating`, whose result is for `replace`; leaves bpy alone."""
+def make_voxelizer(item: bpy.types.Object, bake: bool = False) -> Callable[[Progress | None], list[StoredVolume]]:
+    """Return the work of `update_phantom_job` as a function that leaves bpy alone; its result is for `replace_voxels`."""
     settings = settings_of(item)
     if settings is None:
         raise InputError("no phantom is active: select one that was added with its settings")
-    recipe, folder, made = recipe_of(settings), storage.folder(), with_children(item)
-    quantities = [settings.quantity, *(volumes.quantity_of(child) for child in made[1:])]
-    poses = [volumes.pose_of_object(one) for one in made]
-    return lambda progress: recipe.voxelize(quantities, poses, folder, progress, bake)
+    phantom_job, folder, items = copy_settings(settings), storage.folder(), with_children(item)
+    quantities = [settings.quantity, *(volumes.quantity_of(child) for child in items[1:])]
+    poses = [volumes.pose_of_object(member) for member in items]
+    return lambda progress: phantom_job.voxelize(quantities, poses, folder, progress, bake)
 
 
-def replace(item: bpy.types.Object, stored: Sequence[StoredVolume], baked: bool = False) -> None:
-    """Give a phantom and its children the voxels that `remaking` made; they stay where they are."""
-    made = with_children(item)
-    if len(made) != len(stored):
+def replace_voxels(item: bpy.types.Object, stored: Sequence[StoredVolume], baked: bool = False) -> None:
+    """Give a phantom and its children the voxels of a voxelizer; the objects stay where they are."""
+    items = with_children(item)
+    if len(items) != len(stored):
         raise InputError(f"the volumes of {item.name!r} are not those of before: try again")
-    for volume_object, new in zip(made, stored, strict=True):
+    for volume_object, new in zip(items, stored, strict=True):
         basis = volume_object.matrix_basis.copy()
         volumes.replace_stored(volume_object, new)
         if not baked:
@@ -196,7 +199,7 @@ def replace(item: bpy.types.Object, stored: Sequence[StoredVolume], baked: bool 
             continue
         objects.set_world_matrix(volume_object, new.pose)
         if not np.allclose(objects.world_matrix(volume_object), new.pose, rtol=1e-5, atol=1e-5):
-            volume_object.parent = None  # its shear cannot be undone by the object's own matrix
+            volume_object.parent = None  # the object's own matrix cannot undo the parent's shear
             objects.set_world_matrix(volume_object, new.pose)
     properties = item.mphdrr_volume
     properties.outdated, properties.message = False, ""
@@ -205,46 +208,46 @@ def replace(item: bpy.types.Object, stored: Sequence[StoredVolume], baked: bool 
         return
     remove_outline(item)
     properties.kind = "VOLUME"
-    for child in made[1:]:
+    for child in items[1:]:
         child.mphdrr_volume.with_parent = False
 
 
 def with_children(item: bpy.types.Object) -> list[bpy.types.Object]:
-    """A phantom and the volumes of its other quantities."""
+    """Return a phantom and the volumes of its other quantities."""
     children = [child for child in item.children if volumes.is_volume(child) and child.mphdrr_volume.with_parent]
     return [item, *sorted(children, key=lambda child: child.name)]
 
 
 def mu_energy(item: bpy.types.Object) -> float | None:
-    """The photon energy, keV, at which a volume's mu holds: of a phantom, or of a CT that was converted; else None."""
-    if (root := root_of(item)) is not None:
-        return recipe_of(settings_of(root)).phantom.mu_energy
+    """Return the photon energy, keV, at which a phantom's or a converted CT's mu holds; None where it is unknown."""
+    if (root := owning_phantom(item)) is not None:
+        return copy_settings(settings_of(root)).phantom.mu_energy
     path = volumes.file_of(item)
-    energy = vdb.provenance_of(path).get("energy_keV") if path.is_file() else None
+    energy = vdb.read_provenance(path).get("energy_keV") if path.is_file() else None
     return None if energy is None else float(energy)
 
 
 def require_current(item: bpy.types.Object) -> None:
-    """Raise `InputError` where a volume is of a phantom whose settings have changed since its voxels were made."""
-    if (phantom := outdated(item)) is not None:
+    """Raise `InputError` for a volume of a phantom whose settings have changed since it was voxelized."""
+    if (phantom := outdated_phantom(item)) is not None:
         raise InputError(f"{phantom.name!r} has changed since its voxels were made: press Update Phantom first")
 
 
-def outdated(item: bpy.types.Object) -> bpy.types.Object | None:
-    """The phantom of a volume if its settings have changed since its voxels were made; else None."""
-    phantom = root_of(item)
+def outdated_phantom(item: bpy.types.Object) -> bpy.types.Object | None:
+    """Return the phantom of a volume if its settings have changed since it was voxelized, else None."""
+    phantom = owning_phantom(item)
     return phantom if phantom is not None and phantom.mphdrr_volume.outdated else None
 
 
-def root_of(item: bpy.types.Object) -> bpy.types.Object | None:
-    """The phantom that a volume is, or belongs to as its other quantity; None where there is none."""
+def owning_phantom(item: bpy.types.Object) -> bpy.types.Object | None:
+    """Return the phantom that a volume is, or belongs to as another quantity; None where there is none."""
     if item.mphdrr_volume.with_parent and item.parent is not None:
         item = item.parent
     return None if settings_of(item) is None else item
 
 
 def toggle_outline(item: bpy.types.Object) -> str:
-    """Show the surfaces of a phantom (of one that beats, in its first state) as wires that go with it, or hide them."""
+    """Show the surfaces of a phantom, a beating one in its first state, as wires that go with it, or hide them."""
     if outline_of(item) is not None:
         remove_outline(item)
         return f"Removed the outline of {item.name!r}"
@@ -259,7 +262,7 @@ def update_outline(item: bpy.types.Object) -> None:
 
 
 def outline_of(item: bpy.types.Object) -> bpy.types.Object | None:
-    """A phantom's outline, if it has one."""
+    """Return a phantom's outline, None where it has none."""
     return next((child for child in item.children if _OUTLINE in child), None)
 
 
@@ -271,20 +274,21 @@ def remove_outline(item: bpy.types.Object) -> None:
 
 
 def _show_outline(item: bpy.types.Object) -> None:
-    parts = recipe_of(settings_of(item)).phantom.meshes()
+    """Add the outline of a phantom, in place of an existing one."""
+    parts = copy_settings(settings_of(item)).phantom.meshes()
     starts = np.cumsum([0, *(len(part.vertices) for part in parts)])
     vertices = np.concatenate([part.vertices for part in parts])
     faces = np.concatenate([part.faces + start for part, start in zip(parts, starts[:-1], strict=True)])
     remove_outline(item)
     collection = item.users_collection[0] if item.users_collection else bpy.context.scene.collection
     outline = meshes.add_mesh(Mesh(vertices, faces), f"{item.name} outline", np.eye(4), collection)
-    shape = bmesh.new()
+    edit_mesh = bmesh.new()
     try:  # edges inside flat faces would fill the picture with wires
-        shape.from_mesh(outline.data)
-        bmesh.ops.dissolve_limit(shape, angle_limit=0.01, verts=shape.verts, edges=shape.edges)
-        shape.to_mesh(outline.data)
+        edit_mesh.from_mesh(outline.data)
+        bmesh.ops.dissolve_limit(edit_mesh, angle_limit=0.01, verts=edit_mesh.verts, edges=edit_mesh.edges)
+        edit_mesh.to_mesh(outline.data)
     finally:
-        shape.free()
+        edit_mesh.free()
     outline[_OUTLINE] = True
     outline.display_type = "WIRE"
     outline.hide_render = outline.hide_select = True

@@ -1,4 +1,4 @@
-"""Volumes of the scene as files for other programs."""
+"""Export of the scene's volumes to files for other programs."""
 
 from pathlib import Path
 from typing import Any
@@ -16,8 +16,8 @@ WRITTEN_ENDINGS = (".vdb", *VOLUME_FORMATS)
 """Endings of the names of files that volumes can be written to."""
 
 
-def exporting(item: bpy.types.Object, path: Path) -> jobs.Job:
-    """The job that writes every voxel of a volume, where it stands in the world; the name's ending chooses the format."""
+def export_job(item: bpy.types.Object, path: Path) -> jobs.Job:
+    """Return the job that writes every voxel of a volume at its place in the world; the name's ending chooses the format."""
     if not path.name.lower().endswith(WRITTEN_ENDINGS):
         raise InputError(f"{path}: expected a name ending in {', '.join(WRITTEN_ENDINGS)}")
     read = volumes.reader(item)

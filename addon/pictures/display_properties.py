@@ -1,4 +1,4 @@
-"""How projections are shown: `Scene.mphdrr_display`."""
+"""Settings for showing projections: `Scene.mphdrr_display`."""
 
 import bpy
 from bpy.props import BoolProperty, EnumProperty, FloatProperty, FloatVectorProperty
@@ -14,14 +14,14 @@ _SCALE_TEXTS = {
 }
 _PLANES = (
     ("NONE", "None", "No planes"),
-    ("ACTIVE", "Active", "That of the active module"),
-    ("RING", "Ring", "Those of the active module's ring"),
-    ("ALL", "All", "Those of all visible modules"),
+    ("ACTIVE", "Active", "The plane of the active module"),
+    ("RING", "Ring", "The planes of the active module's ring"),
+    ("ALL", "All", "The planes of all visible modules"),
 )
 
 
 class DisplayProperties(bpy.types.PropertyGroup):
-    """How the last run's projections are shown; the exact numbers stay."""
+    """Colours, window and planes with which the last run's projections are shown; the exact numbers stay."""
 
     colors: EnumProperty(
         name="Colors", description="Colours of the numbers; all but grey are perceptually uniform",
@@ -29,7 +29,7 @@ class DisplayProperties(bpy.types.PropertyGroup):
         default="INFERNO", update=updates.on_edit("display"),
     )  # fmt: skip
     scale: EnumProperty(
-        name="Scale", description="How the colours follow the numbers",
+        name="Scale", description="Relation between numbers and colours",
         items=choices.items({}, ((name.upper(), *_SCALE_TEXTS[name]) for name in SCALES)),
         default="LINEAR", update=updates.on_edit("display"),
     )  # fmt: skip
@@ -38,43 +38,43 @@ class DisplayProperties(bpy.types.PropertyGroup):
         update=updates.on_edit("display"),
     )  # fmt: skip
     low: FloatProperty(
-        name="Low", description="The number that has the first colour", default=0.0, update=updates.on_edit("display")
+        name="Low", description="Number with the first colour", default=0.0, update=updates.on_edit("display")
     )
     high: FloatProperty(
-        name="High", description="The number that has the last colour", default=1.0, update=updates.on_edit("display")
+        name="High", description="Number with the last colour", default=1.0, update=updates.on_edit("display")
     )
     half: BoolProperty(
         name="Central Half", description="Show the middle half of each image, often called FOV; all of it is the wide FOV",
         update=updates.on_edit("display"),
     )  # fmt: skip
     planes: EnumProperty(
-        name="Planes", description="Whose projections stand in the scene, between pinhole and ROI",
+        name="Planes", description="Modules whose projections stand in the scene",
         items=choices.items({}, _PLANES), default="ALL", update=updates.on_edit("planes"),
     )  # fmt: skip
     plane_distance: FloatProperty(
-        name="Distance", description="Of the planes from the pinholes, mm; 0: between pinhole and ROI", min=0.0,
+        name="Distance", description="Distance of the planes from the pinholes, mm; 0: automatic", min=0.0,
         soft_max=500.0, update=updates.on_edit("planes"),
     )  # fmt: skip
     preview_place: FloatVectorProperty(
-        name="Preview's Place", description="Of the live preview in the 3D views: shares of the way to the right, and up",
+        name="Preview's Place", description="Position of the live preview in the 3D views, 0 to 1 to the right and up",
         size=2, default=(1.0, 0.0), min=0.0, max=1.0, options={"HIDDEN"},
     )  # fmt: skip
     plane_at_detector: BoolProperty(
-        name="At Virtual Detector", description="Put the planes where the images truly are: behind the ROI",
+        name="At Virtual Detector", description="Put the planes at the virtual detectors, behind the ROI",
         update=updates.on_edit("planes"),
     )  # fmt: skip
     plane_opacity: FloatProperty(
-        name="Opacity", description="Of the planes and of the pictures in the cameras' views", subtype="FACTOR", min=0.0,
+        name="Opacity", description="Opacity of the planes and of pictures in the cameras' views", subtype="FACTOR", min=0.0,
         max=1.0, default=1.0, update=updates.on_edit("planes"),
     )  # fmt: skip
     backgrounds: BoolProperty(
-        name="In Camera Views", description="Lay each projection over what its module's camera sees", default=True,
+        name="In Camera Views", description="Lay each projection over the view of its module's camera", default=True,
         update=updates.on_edit("planes"),
     )  # fmt: skip
 
     @property
     def problem(self) -> str:
-        """What is wrong with the window; "" where it is good."""
+        """Problem of the window in words; "" for a valid window."""
         try:
             self.display()
         except InputError as error:
@@ -82,7 +82,7 @@ class DisplayProperties(bpy.types.PropertyGroup):
         return ""
 
     def display(self) -> Display:
-        """The colours, scale and window; raises `InputError` where the window is none."""
+        """Return the colours, scale and window; raise `InputError` for an invalid window."""
         low, high = (None, None) if self.automatic else (self.low, self.high)
         return Display(self.colors.lower(), self.scale.lower(), low, high, self.half)
 

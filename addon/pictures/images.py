@@ -1,7 +1,8 @@
 """Projections as Blender images, shown as the pinhole sees them: +v up, +u left.
 
-The arrays' column index grows along +u, so an image's columns are reversed; its rows start at the bottom, as the arrays' do.
-Each module has two: one holds the exact float32 numbers in R, G and B, the other, as the mosaic, shows them in colours.
+The arrays' column index grows along +u, so an image's columns are reversed; its rows start at the bottom, as the arrays'
+do. Each module has two images: one holds the exact float32 numbers in R, G and B; the other one is coloured, as the mosaic
+is.
 """
 
 from collections.abc import Callable, Generator
@@ -21,67 +22,67 @@ from ...core.runs.exr import exr_bytes
 from ...core.runs.mosaic import Sheet, as_seen, labels, png, sheet, smaller
 from ..blender import ids, jobs, reports, windows
 
-_KEY = "mphdrr_projection"  # custom property: marks the images that a new run replaces; False of those of no run
+_KEY = "mphdrr_projection"  # custom property of images that a new run replaces: True of a run's, False of a file's
 _ARRAYS = ("sources", "detector_centers", "u_steps", "v_steps")
-_PIXELS = 2.2e7
-"""About as many all pictures have together: larger images are shown smaller, since drawing a picture takes memory again."""
-_PNG_LEVEL = 1  # fast
+_MAX_PIXELS = 2.2e7
+"""Approximate limit of all pictures' pixels together, since drawing a picture takes memory again; larger ones shrink."""
+_PNG_LEVEL = 1  # fast compression
 BAR = 24
-"""Pixels at a resolution scale of 1 at the bottom of an Image Editor that are left free for notes (`run_notes`)."""
-_SHARE = 0.97  # of its editor that a picture of another size takes: buttons at the edges do not cover it
-_BELOW = 0.4  # of the 3D view's height: an Image Editor that is opened below it
-_WAIT = 0.005  # s between two looks at a thread
-_SCANNER = "mphdrr_scanner"  # custom property of the mosaic: the collection of the scanner that the run is of
+"""Height, pixels at a resolution scale of 1, that is left free at the bottom of an Image Editor for `run_notes`."""
+_FILLED_SHARE = 0.97  # share of the editor that a zoomed picture fills, so that buttons at the edges do not cover it
+_EDITOR_SHARE = 0.4  # share of the 3D view's height for an Image Editor that is opened below it
+_WAIT = 0.005  # s between two checks of a worker thread
+_SCANNER = "mphdrr_scanner"  # custom property of the mosaic: the collection of the run's scanner
 _TEXT = "mphdrr_difference"  # custom property of a difference: its numbers, in words
-_LABELS = "mphdrr_labels"  # custom property of the mosaic: what stands in each of its images, line by line
-_TILES = "mphdrr_tiles"  # custom property of the mosaic: its modules, unit, and where in it which one's image is
+_LABELS = "mphdrr_labels"  # custom property of the mosaic: the label of each tile, line by line
+_TILES = "mphdrr_tiles"  # custom property of the mosaic: its modules, its unit, and the position of each tile
 _VIEWS = "mphdrr_views"  # custom property of the mosaic: the run's views, as arrays of `Views`, and their ROI radii
 
 
 @dataclass(frozen=True)
 class Pictures:
-    """Files with what the images of a run hold, made in a thread."""
+    """Files with the contents of a run's images, made in a worker thread."""
 
     display: Display
-    exact: list[bytes]  # OpenEXR, of float32
-    colored: list[bytes]  # PNG
-    mosaic: bytes  # PNG
-    drawn: Sheet  # what is where in the mosaic
+    exact: list[bytes]  # OpenEXR files of float32 numbers, one per module
+    colored: list[bytes]  # PNG files, one per module
+    mosaic: bytes  # PNG file
+    layout: Sheet  # layout of the mosaic's tiles
 
 
-def pictures(run: ProjectionRun, display: Display, progress: Progress | None = None) -> Pictures:
-    """Make the contents of a run's images; leaves bpy alone. `progress` counts the files."""
-    exact = _in_threads(exr_bytes, as_seen(run.projections), part_of(progress, 0, 2))
+def make_pictures(run: ProjectionRun, display: Display, progress: Progress | None = None) -> Pictures:
+    """Make the contents of a run's images without bpy; `progress` counts the files."""
+    exact = _make_all(exr_bytes, as_seen(run.projections), part_of(progress, 0, 2))
     rings = run.system.rings().tolist()
-    colored = _colored(run.projections, display, part_of(progress, 1, 2))
-    return Pictures(display, exact, colored, *_mosaic(run.projections, labels(run), rings, run.unit, display))
+    colored = _color(run.projections, display, part_of(progress, 1, 2))
+    return Pictures(display, exact, colored, *_draw_mosaic(run.projections, labels(run), rings, run.unit, display))
 
 
-def storing(run: ProjectionRun, made: Pictures) -> Generator[tuple[str, int, int] | None, None, bpy.types.Image]:
-    """Make images of a run, packed into the .blend, in place of those of an earlier run.
+def store_images(run: ProjectionRun, files: Pictures) -> Generator[tuple[str, int, int] | None, None, bpy.types.Image]:
+    """Yield the steps that store a run's images, packed into the .blend, in place of an earlier run's; return the mosaic.
 
-    For each module one of the exact numbers, float32, and one to look at; and the mosaic, which is returned. Yields
-    between steps, so that a window can be drawn; what ends it there leaves the earlier run's images as they are.
-    `made` is what `pictures` has made.
+    For each module there is an image of the exact float32 numbers and a coloured one. `files` is the result of
+    `make_pictures`. Between steps a window can be drawn; an exception thrown there leaves the earlier run's images as they
+    are.
     """
     numbers = run.system.numbers.tolist()
-    new: dict[str, bpy.types.Image] = {}
+    new_images: dict[str, bpy.types.Image] = {}
     try:
-        for k, (number, exact, colored) in enumerate(zip(numbers, made.exact, made.colored, strict=True)):
+        for k, (number, exact, colored) in enumerate(zip(numbers, files.exact, files.colored, strict=True)):
             yield "storing", k, len(numbers)
             name = projection_name(number, numbers)
-            new[name] = bpy.data.images.new(name, 1, 1, float_buffer=True, is_data=True)
-            filled(new[name], exact)
-            new[ids.picture_name(name)] = _new_picture(ids.picture_name(name), colored)
+            new_images[name] = bpy.data.images.new(name, 1, 1, float_buffer=True, is_data=True)
+            fill(new_images[name], exact)
+            new_images[ids.picture_name(name)] = _new_picture(ids.picture_name(name), colored)
         yield "storing", len(numbers), len(numbers)
-        new[ids.MOSAIC] = _new_picture(ids.MOSAIC, made.mosaic)  # as large as all: it has a turn of its own
+        new_images[ids.MOSAIC] = _new_picture(ids.MOSAIC, files.mosaic)  # in its own step: as large as all others
         yield "storing", len(numbers), len(numbers)
     except BaseException:
-        bpy.data.batch_remove(new.values())
+        bpy.data.batch_remove(new_images.values())
         raise
-    _put_in_place(new)
-    mosaic = new[ids.MOSAIC]
-    _describe(mosaic, made.drawn, numbers, run.system.rings().tolist(), run.unit, made.display)
+    _replace_images(new_images)
+    mosaic = new_images[ids.MOSAIC]
+    _store_tiles(mosaic, files.layout, numbers, run.system.rings().tolist(), run.unit, files.display)
     mosaic[_LABELS] = "\n".join(labels(run))
     arrays = {name: getattr(run.views, name).ravel().tolist() for name in _ARRAYS}
     system = run.system
@@ -90,44 +91,44 @@ def storing(run: ProjectionRun, made: Pictures) -> Generator[tuple[str, int, int
     return mosaic
 
 
-def showing_again(display: Display, kept: dict[int, NDArray[np.float32]]) -> Generator[bool, None, None]:
-    """Make the pictures anew from the exact images, as `display` says; nothing where there is no run.
+def recolor_images(display: Display, arrays: dict[int, NDArray[np.float32]]) -> Generator[bool, None, None]:
+    """Yield while making the pictures of the shown run again from its exact images, as `display` says.
 
-    Yields between its steps whether the mosaic, which is the first, is made. `kept` holds the numbers that were read, by the
-    mosaic's `session_uid`, for the next time.
+    Each yielded value says whether the mosaic, which is the first picture, is made. `arrays` keeps the projections that
+    were read, by the mosaic's `session_uid`, for the next call.
     """
     mosaic = bpy.data.images.get(ids.MOSAIC)
-    shown = tiles(mosaic)
-    if mosaic is None or shown is None:
+    mosaic_tiles = tiles(mosaic)
+    if mosaic is None or mosaic_tiles is None:
         return
-    numbers, rings, unit = (shown[name] for name in ("numbers", "rings", "unit"))
+    numbers, rings, unit = (mosaic_tiles[name] for name in ("numbers", "rings", "unit"))
     texts = str(mosaic[_LABELS]).split("\n") if _LABELS in mosaic else list(map(str, numbers))
     names, uid = [projection_name(number, numbers) for number in numbers], mosaic.session_uid
-    if uid not in kept:
-        found = []
+    if uid not in arrays:
+        exact_arrays = []
         for name in names:
             if (exact := bpy.data.images.get(name)) is None:
                 return
-            found.append(projection_array(exact))
+            exact_arrays.append(projection_array(exact))
             yield False
-        kept.clear()
-        kept[uid] = np.stack(found)
-        del found
-    projections = kept[uid]
-    file, drawn = yield from _in_thread(lambda progress: _mosaic(projections, texts, rings, unit, display), False)
-    mosaic = filled(bpy.data.images[ids.MOSAIC], file)
-    _describe(_read_now(mosaic), drawn, numbers, rings, unit, None)
-    files = yield from _in_thread(lambda progress: _colored(projections, display, progress), True)
+        arrays.clear()
+        arrays[uid] = np.stack(exact_arrays)
+        del exact_arrays
+    projections = arrays[uid]
+    file, layout = yield from _run_in_worker(lambda _: _draw_mosaic(projections, texts, rings, unit, display), False)
+    mosaic = fill(bpy.data.images[ids.MOSAIC], file)
+    _store_tiles(_load_pixels(mosaic), layout, numbers, rings, unit, None)
+    files = yield from _run_in_worker(lambda progress: _color(projections, display, progress), True)
     for name, file in zip(names, files, strict=True):
         picture = bpy.data.images.get(ids.picture_name(name))
         if picture is not None:
-            _read_now(filled(picture, file))
+            _load_pixels(fill(picture, file))
             yield True
-    _describe(bpy.data.images[ids.MOSAIC], drawn, numbers, rings, unit, display)
+    _store_tiles(bpy.data.images[ids.MOSAIC], layout, numbers, rings, unit, display)
 
 
-def _in_thread(make: Callable[[Progress], Any], is_mosaic_made: bool) -> Generator[bool, None, Any]:
-    """What `make` makes in a thread; yields `is_mosaic_made` meanwhile."""
+def _run_in_worker(make: Callable[[Progress], Any], is_mosaic_made: bool) -> Generator[bool, None, Any]:
+    """Run `make` in a worker thread and return its result; yield `is_mosaic_made` while waiting."""
     worker = jobs.Worker("Colours", make)
     worker.start()
     try:
@@ -142,38 +143,38 @@ def _in_thread(make: Callable[[Progress], Any], is_mosaic_made: bool) -> Generat
 
 
 def tiles(image: bpy.types.Image | None) -> dict[str, Any] | None:
-    """What the mosaic shows: `numbers` and `rings` of its modules, `unit`, the tiles' size `tile` and `corners`; else None.
+    """Return the mosaic's tiles: `numbers` and `rings` of its modules, `unit`, tile size `tile` and `corners`; None without.
 
-    Rows and columns are counted from the top left. `window` is that of the colours; `totals` are what `summed` says of each
-    image, "sum" or "mean", `maxima` their largest numbers, and `half` whether only their middle halves are meant and shown.
-    `display` is how all pictures are shown, "None" while they are made. Files
-    of earlier versions lack these six.
+    Rows and columns count from the top left. `window` is that of the colours; `totals` are each image's "sum" or "mean", as
+    `summed` says, and `maxima` its largest number; `half` tells whether only the middle halves of the images are used and
+    shown. `display` is the display of all pictures, "None" while they are being made. Files of earlier versions lack these
+    six.
     """
     return None if image is None or _TILES not in image else image[_TILES].to_dict()
 
 
-def views_of(mosaic: bpy.types.Image) -> tuple[Views, NDArray[np.float64]] | None:
-    """The views of the mosaic's run, in its modules' order, and the radii of their ROIs (M,), mm.
+def mosaic_views(mosaic: bpy.types.Image) -> tuple[Views, NDArray[np.float64]] | None:
+    """Return the views of the mosaic's run, in its modules' order, and the radii of their ROIs (M,), mm.
 
     None in files of versions that did not keep them, until a run is shown anew.
     """
     if _VIEWS not in mosaic:
         return None
-    kept = mosaic[_VIEWS].to_dict()
-    arrays: dict[str, Any] = {name: np.reshape(kept[name], (-1, 3)) for name in _ARRAYS}
-    n_v, n_u = kept["shape"]
-    return Views(**arrays, shape=(n_v, n_u)), np.array(kept["roi_radius"])
+    stored = mosaic[_VIEWS].to_dict()
+    arrays: dict[str, Any] = {name: np.reshape(stored[name], (-1, 3)) for name in _ARRAYS}
+    n_v, n_u = stored["shape"]
+    return Views(**arrays, shape=(n_v, n_u)), np.array(stored["roi_radius"])
 
 
-def share_shown() -> tuple[float, float]:
-    """What the pictures show of the width and height of the exact images."""
+def shown_fraction() -> tuple[float, float]:
+    """Return the fractions of the exact images' width and height that the pictures show."""
     mosaic = bpy.data.images.get(ids.MOSAIC)
     x, y = (1.0, 1.0) if mosaic is None or _TILES not in mosaic else mosaic[_TILES].get("share", (1.0, 1.0))
     return x, y
 
 
 def set_scanner(mosaic: bpy.types.Image, collection: bpy.types.Collection | None) -> None:
-    """Note which scanner the mosaic's run is of."""
+    """Store the scanner of the mosaic's run."""
     if collection is not None:
         mosaic[_SCANNER] = collection
     elif _SCANNER in mosaic:
@@ -181,39 +182,39 @@ def set_scanner(mosaic: bpy.types.Image, collection: bpy.types.Collection | None
 
 
 def scanner_of(mosaic: bpy.types.Image) -> bpy.types.Collection | None:
-    """The scanner that the mosaic's run is of; None where it has been removed."""
+    """Return the scanner of the mosaic's run; None where it has been removed."""
     return mosaic.get(_SCANNER)
 
 
-def is_of(scene: bpy.types.Scene) -> bool:
-    """Whether the images are of a run of that scene, as far as is known."""
+def belong_to(scene: bpy.types.Scene) -> bool:
+    """Return whether the images are of a run of a scene, or of an unknown one."""
     mosaic = bpy.data.images.get(ids.MOSAIC)
     owner = None if mosaic is None else scanner_of(mosaic)
     return owner is None or owner in scene.collection.children_recursive[:]
 
 
 def projection_name(number: int, numbers: list[int]) -> str:
-    """Name of the exact image of the module `number` of a run of the modules `numbers`."""
+    """Return the name of the exact image of module `number` in a run of the modules `numbers`."""
     return ids.projection_name(number, max(numbers))
 
 
-def _colored(projections: NDArray[np.float32], display: Display, progress: Progress | None = None) -> list[bytes]:
-    """The pictures of projections (M, n_v, n_u) in one window, as PNG files; `progress` counts them."""
+def _color(projections: NDArray[np.float32], display: Display, progress: Progress | None = None) -> list[bytes]:
+    """Return the pictures of projections (M, n_v, n_u) in one window, as PNG files; `progress` counts them."""
     window = display.window(projections)
-    shown = smaller(as_seen(display.part(projections)), _PIXELS)
-    return _in_threads(lambda picture: png(display.colored(picture, window), _PNG_LEVEL), shown, progress)
+    shown_pictures = smaller(as_seen(display.part(projections)), _MAX_PIXELS)
+    return _make_all(lambda picture: png(display.colored(picture, window), _PNG_LEVEL), shown_pictures, progress)
 
 
-def _mosaic(
+def _draw_mosaic(
     projections: NDArray[np.float32], texts: list[str], rings: list[int], unit: str, display: Display
 ) -> tuple[bytes, Sheet]:
-    """The mosaic of projections (M, n_v, n_u), with a text in each, as a PNG file, and what is where in it."""
-    drawn = sheet(projections, texts, rings, unit, display)
-    return png(drawn.picture, _PNG_LEVEL), drawn
+    """Return the mosaic of projections (M, n_v, n_u), with a text in each tile, as a PNG file, and its layout."""
+    layout = sheet(projections, texts, rings, unit, display)
+    return png(layout.picture, _PNG_LEVEL), layout
 
 
-def _in_threads(make: Callable[[Any], bytes], pictures: NDArray[np.float32], progress: Progress | None) -> list[bytes]:
-    """What `make` makes of each picture."""
+def _make_all(make: Callable[[Any], bytes], pictures: NDArray[np.float32], progress: Progress | None) -> list[bytes]:
+    """Return the files that `make` returns for the pictures, made in several threads."""
     files: list[bytes] = []
     with ThreadPoolExecutor(memory.cores()) as pool:
         for file in pool.map(make, pictures):
@@ -222,49 +223,49 @@ def _in_threads(make: Callable[[Any], bytes], pictures: NDArray[np.float32], pro
     return files
 
 
-def _describe(
-    image: bpy.types.Image, drawn: Sheet, numbers: list[int], rings: list[int], unit: str, display: Display | None
+def _store_tiles(
+    image: bpy.types.Image, layout: Sheet, numbers: list[int], rings: list[int], unit: str, display: Display | None
 ) -> None:
-    """Note on the mosaic what is where in it, and which display the pictures show; None: not all of them one."""
+    """Store the mosaic's layout on its image, and the display of all pictures; None if they have different ones."""
     image[_TILES] = {
-        "numbers": numbers, "rings": rings, "unit": unit, "corners": drawn.corners.ravel().tolist(), "tile": drawn.tile,
-        "window": drawn.window, "summed": drawn.summed, "totals": drawn.totals.tolist(), "maxima": drawn.maxima.tolist(),
-        "half": drawn.half, "share": drawn.share,
+        "numbers": numbers, "rings": rings, "unit": unit, "corners": layout.corners.ravel().tolist(), "tile": layout.tile,
+        "window": layout.window, "summed": layout.summed, "totals": layout.totals.tolist(), "maxima": layout.maxima.tolist(),
+        "half": layout.half, "share": layout.share,
         "display": repr(display),
     }  # fmt: skip
 
 
-def store_difference(drawn: Sheet, numbers: list[int], unit: str, text: str) -> bpy.types.Image:
-    """Make the image of a difference of two runs, until other projections are shown; `text` says its numbers."""
-    image = _store(ids.DIFFERENCE, png(drawn.picture, _PNG_LEVEL))
-    _describe(image, drawn, numbers, [], unit, None)
+def store_difference(layout: Sheet, numbers: list[int], unit: str, text: str) -> bpy.types.Image:
+    """Store the image of the difference of two runs until other projections are shown; `text` has its numbers."""
+    image = _store_image(ids.DIFFERENCE, png(layout.picture, _PNG_LEVEL))
+    _store_tiles(image, layout, numbers, [], unit, None)
     image[_TEXT] = text
     return image
 
 
-def store_drawn(name: str, file: bytes) -> bpy.types.Image:
-    """Make the image of that name, of a PNG, until other projections are shown: of a reconstruction, or of residuals."""
-    image = _store(name, file)
+def store_png(name: str, file: bytes) -> bpy.types.Image:
+    """Store a PNG of a reconstruction or of residuals as the image of that name, until other projections are shown."""
+    image = _store_image(name, file)
     windows.redraw("IMAGE_EDITOR")
     return image
 
 
-def _store(name: str, file: bytes) -> bpy.types.Image:
-    """One of our images of that name, showing a PNG; saved while nothing shows it."""
+def _store_image(name: str, file: bytes) -> bpy.types.Image:
+    """Return our image of that name with the contents of a PNG; it is saved even while nothing shows it."""
     old = bpy.data.images.get(name)
-    image = _new_picture(name, file) if old is None else filled(old, file)
+    image = _new_picture(name, file) if old is None else fill(old, file)
     image.use_fake_user, image[_KEY] = True, True
     return image
 
 
 def difference_text() -> str:
-    """The numbers of the difference that was drawn last; "" where there is none."""
+    """Return the numbers of the difference that was drawn last; "" where there is none."""
     image = bpy.data.images.get(ids.DIFFERENCE)
     return str(image.get(_TEXT, "")) if image is not None else ""
 
 
 def is_ours(image: bpy.types.Image | None) -> bool:
-    """Whether an image is of a run."""
+    """Return whether an image is of a run."""
     return image is not None and bool(image.get(_KEY))
 
 
@@ -274,125 +275,124 @@ def clear() -> None:
 
 
 def is_exact(image: bpy.types.Image) -> bool:
-    """Whether an image holds the exact numbers of a module's projection."""
+    """Return whether an image holds the exact numbers of a module's projection."""
     return _KEY in image and image.is_float
 
 
 def projection_array(image: bpy.types.Image) -> NDArray[np.float32]:
-    """The projection (n_v, n_u) that a module image holds, in the arrays' order."""
+    """Return the projection (n_v, n_u) that a module's exact image holds, in the arrays' order."""
     was_read = image.has_data
     width, height = image.size
     pixels = np.empty(4 * width * height, np.float32)
     image.pixels.foreach_get(pixels)
     if not was_read and image.packed_file is not None:
-        image.buffers_free()  # four times the size of the numbers
+        image.buffers_free()  # the buffer has four times the size of the numbers
     return np.ascontiguousarray(pixels.reshape(height, width, 4)[:, ::-1, 0])
 
 
 def show(image: bpy.types.Image, context: bpy.types.Context) -> bool:
-    """Show an image in an Image Editor that shows it, or the largest one that shows none or one of ours; False without."""
+    """Show an image in an Image Editor that shows it, or else in the largest free one; return False if there is none."""
     editors = _editors(context)
-    chosen = [each for each in editors if each[1].spaces.active.image == image] or editors[-1:]
-    for window, area in chosen:
+    targets = [editor for editor in editors if editor[1].spaces.active.image == image] or editors[-1:]
+    for window, area in targets:
         area.spaces.active.image = image
         _fit(window, area)
-    return bool(chosen)
+    return bool(targets)
 
 
 def show_file(path: Path, context: bpy.types.Context) -> None:
-    """Show a picture that was written to a file, until other projections are shown."""
-    known = set(bpy.data.images)
+    """Show a picture file until other projections are shown."""
+    existing = set(bpy.data.images)
     image = bpy.data.images.load(str(path), check_existing=True)
     image.reload()  # the file may be newer
-    if image not in known:
+    if image not in existing:
         image[_KEY] = False
     show_below(image, context)
 
 
 def _editors(context: bpy.types.Context) -> list[tuple[bpy.types.Window, bpy.types.Area]]:
-    """The Image Editors that nobody works in: they show none, or one of our pictures; the largest is the last."""
-    found = []
+    """Return the free Image Editors: those that show no image, or one of ours; the largest is the last."""
+    editors = []
     for window in context.window_manager.windows:
         for area in window.screen.areas:
             space = area.spaces.active
             if area.type == "IMAGE_EDITOR" and space.mode == "VIEW" and (space.image is None or _KEY in space.image):
-                found.append((window, area))
-    return sorted(found, key=lambda each: each[1].width * each[1].height)
+                editors.append((window, area))
+    return sorted(editors, key=lambda editor: editor[1].width * editor[1].height)
 
 
-def room(context: bpy.types.Context) -> tuple[int, int, float] | None:
-    """Width and height, pixels, that a picture fills in the editor in which `show` shows it, and the scale of its texts.
-
-    None where no such editor is open.
-    """
+def editor_size(context: bpy.types.Context) -> tuple[int, int, float] | None:
+    """Return width and height, pixels, that `show` gives a picture, and the scale of its texts; None without an editor."""
     editors = _editors(context)
-    return (*_room(editors[-1][1]), context.preferences.system.ui_scale) if editors else None
+    return (*_picture_size(editors[-1][1]), context.preferences.system.ui_scale) if editors else None
 
 
-def _room(area: bpy.types.Area) -> tuple[int, int]:
+def _picture_size(area: bpy.types.Area) -> tuple[int, int]:
+    """Return width and height, pixels, of an Image Editor above the bar for notes."""
     region = next(region for region in area.regions if region.type == "WINDOW")
     return region.width, region.height - round(BAR * bpy.context.preferences.system.ui_scale)
 
 
 PROJECTED: reports.Need = (lambda context: ids.MOSAIC in bpy.data.images, "No projections yet: render them first")
+"""Requirement of an operator: there are projections."""
 
 
 def show_below(image: bpy.types.Image, context: bpy.types.Context) -> bool:
-    """Like `show`, but open an Image Editor below the largest 3D view if none is free; False without a window."""
+    """Show an image, in a new Image Editor below the largest 3D view if none is free; return False without a window."""
     return open_editor(context) and show(image, context)
 
 
 def open_editor(context: bpy.types.Context) -> bool:
-    """Open an Image Editor below the largest 3D view, unless there is one that nobody works in; False without a window."""
+    """Open an Image Editor below the largest 3D view unless one is free; return False without a window."""
     window = context.window
     views = [a for a in window.screen.areas if a.type == "VIEW_3D"] if window else []
     if _editors(context) or not views:
         return bool(_editors(context))
     view = max(views, key=lambda a: a.width * a.height)
-    before = set(window.screen.areas)
+    old_areas = set(window.screen.areas)
     with context.temp_override(window=window, area=view, region=view.regions[-1]):
-        bpy.ops.screen.area_split(direction="HORIZONTAL", factor=_BELOW)
-    new = [a for a in window.screen.areas if a not in before]
-    area = min([*new, view], key=lambda a: a.y)
+        bpy.ops.screen.area_split(direction="HORIZONTAL", factor=_EDITOR_SHARE)
+    new_areas = [a for a in window.screen.areas if a not in old_areas]
+    area = min([*new_areas, view], key=lambda a: a.y)
     area.type = "IMAGE_EDITOR"
-    area.spaces.active.image, area.spaces.active.show_gizmo = None, False  # they would hide the colour bar
+    area.spaces.active.image, area.spaces.active.show_gizmo = None, False  # gizmos would hide the colour bar
     return True
 
 
 def _fit(window: bpy.types.Window, area: bpy.types.Area) -> None:
-    """Show all of an editor's image, above the bar where notes stand; one that is as large as its room, pixel by pixel."""
+    """Show all of an editor's image above the bar for notes; pixel by pixel if it has just that size."""
     region = next((r for r in area.regions if r.type == "WINDOW"), None)
     if region is None or bpy.app.background:
         return
     area.tag_redraw()
 
-    def fit() -> None:  # after the redraw, when a new editor knows its size
+    def fit() -> None:  # called after the redraw, when a new editor knows its size
         try:
             with bpy.context.temp_override(window=window, area=area, region=region):
-                width, height = area.spaces.active.image.size
-                (across, up), whole = _room(area), region.height
-                zoom = min(across / width, up / height) * (1.0 if (width, height) == (across, up) else _SHARE)
-                bpy.ops.image.view_all(fit_view=True)  # its middle is the region's
+                size, free = tuple(area.spaces.active.image.size), _picture_size(area)
+                zoom = min(free[0] / size[0], free[1] / size[1]) * (1.0 if size == free else _FILLED_SHARE)
+                bpy.ops.image.view_all(fit_view=True)  # centres it in the region
                 bpy.ops.image.view_zoom_ratio(ratio=zoom)
-                bpy.ops.image.view_pan(offset=(0.0, -(whole - up) / 2 / zoom))
+                bpy.ops.image.view_pan(offset=(0.0, -(region.height - free[1]) / 2 / zoom))
         except (RuntimeError, ReferenceError, TypeError, AttributeError):
-            pass  # the window or the editor was closed meanwhile
+            pass  # the window or the editor has been closed
 
     bpy.app.timers.register(fit, first_interval=0.2)
 
 
 def _new_picture(name: str, png: bytes) -> bpy.types.Image:
-    return _read_now(filled(bpy.data.images.new(name, 1, 1), png))
+    """Return a new image with the contents of a PNG file."""
+    return _load_pixels(fill(bpy.data.images.new(name, 1, 1), png))
 
 
-def _read_now(image: bpy.types.Image) -> bpy.types.Image:
-    """Have an image's pixels read in a step of its own, and not when all are first drawn."""
+def _load_pixels(image: bpy.types.Image) -> bpy.types.Image:
+    """Make Blender read an image's pixels now, in a step of its own, and not when all images are first drawn."""
     len(image.pixels)
     return image
 
 
-def filled(image: bpy.types.Image, file: bytes) -> bpy.types.Image:
-    """Pack the contents of a file into an image, which shows it from now on."""
+def fill(image: bpy.types.Image, file: bytes) -> bpy.types.Image:
+    """Pack the contents of a file into an image, so that it shows them, and return the image."""
     image.pack(data=file, data_len=len(file))
     if image.source != "FILE":
         image.source = "FILE"
@@ -402,16 +402,16 @@ def filled(image: bpy.types.Image, file: bytes) -> bpy.types.Image:
     return image
 
 
-def _put_in_place(new: dict[str, bpy.types.Image]) -> None:
-    """Give new images their names; they replace all our images of before."""
+def _replace_images(new: dict[str, bpy.types.Image]) -> None:
+    """Give new images their names, in place of all our earlier images."""
     old = {image for image in bpy.data.images if _KEY in image}
     for name, image in new.items():
-        before = bpy.data.images.get(name)
-        if before in old and before.users > before.use_fake_user:
-            before.user_remap(image)
-        elif before is not None and before not in old and before != image:  # somebody else's image has our name
-            before.name = f"{name}.other"
-        image.use_fake_user = True  # or it is not saved while nothing shows it
+        namesake = bpy.data.images.get(name)
+        if namesake in old and namesake.users > namesake.use_fake_user:
+            namesake.user_remap(image)
+        elif namesake is not None and namesake not in old and namesake != image:  # the user's image has our name
+            namesake.name = f"{name}.other"
+        image.use_fake_user = True  # saves the image even while nothing shows it
     bpy.data.batch_remove(old)
     for name, image in new.items():
         image.name, image[_KEY] = name, True

@@ -1,7 +1,7 @@
-"""The pictures of the shown run in other colours or another window, made while Blender's window stays alive.
+"""Recolouring of the shown run's pictures after an edit of the display, made while Blender's window stays alive.
 
-Step by step, the main thread reads the exact numbers and fills the images; a thread colours them. The mosaic comes first:
-where the display has been edited again by then, the newest one's mosaic is made next.
+Step by step, the main thread reads the exact numbers and fills the images; a worker thread colours them. The mosaic comes
+first: if the display has been edited again by then, the mosaic is made next with the newest display.
 """
 
 import time
@@ -15,65 +15,65 @@ from numpy.typing import NDArray
 from ..blender import ids, timers
 from . import images, planes
 
-_REST = 0.05  # s after an edit of the display until the pictures are made anew
-_INTERVAL, _STEP = 0.02, 0.03  # s between turns of the main thread, after each of which it may draw, and of a turn
-_asked = False  # for pictures of the display as it is now
+_PAUSE = 0.05  # s from an edit of the display until the pictures are recoloured
+_INTERVAL, _TURN_TIME = 0.02, 0.03  # s between turns of the main thread, when it may draw, and length of a turn
+_is_requested = False  # whether pictures with the present display are requested
 _steps: Generator[None, None, None] | None = None
 
 
 def display_changed(*_: Any) -> None:
-    """Show the run in other colours or another window; where there is a window, soon and bit by bit."""
-    global _asked
-    _asked = True
+    """Recolour the pictures after an edit of the display; with a window, after a short pause and bit by bit."""
+    global _is_requested
+    _is_requested = True
     if bpy.app.background:
         for _step in recoloring():
             pass
     else:
-        timers.soon(_turn, _REST)
+        timers.schedule(_take_turn, _PAUSE)
 
 
 def check(*_: Any) -> None:
-    """Make the pictures anew where they are not as the display says: Undo, or a file, may have them of different times."""
+    """Recolour the pictures if they do not match the display: Undo, or a file, may have restored only some of them."""
     scene = bpy.context.scene
-    shown = (images.tiles(bpy.data.images.get(ids.MOSAIC)) or {}).get("display")  # no earlier version's has it
-    if shown is None or not images.is_of(scene) or scene.mphdrr_display.problem:
+    drawn = (images.tiles(bpy.data.images.get(ids.MOSAIC)) or {}).get("display")  # absent in older files
+    if drawn is None or not images.belong_to(scene) or scene.mphdrr_display.problem:
         return
-    if shown != repr(scene.mphdrr_display.display()):
+    if drawn != repr(scene.mphdrr_display.display()):
         display_changed()
 
 
 def stop() -> None:
-    """Forget what waits: the extension is disabled."""
-    global _asked, _steps
-    _asked, _steps = False, None
+    """Forget the request and the steps when the extension is disabled."""
+    global _is_requested, _steps
+    _is_requested, _steps = False, None
 
 
 def recoloring() -> Generator[None, None, None]:
-    """The steps that show what is asked for, until nothing is. Between them, anything may change."""
-    global _asked
+    """Yield the steps that recolour the pictures until no request is left; anything may change between steps."""
+    global _is_requested
     numbers: dict[int, NDArray[np.float32]] = {}
-    while _asked:
-        _asked = False
+    while _is_requested:
+        _is_requested = False
         settings, mosaic = bpy.context.scene.mphdrr_display, bpy.data.images.get(ids.MOSAIC)
-        if settings.problem or mosaic is None:  # one between the typing of the window's two ends
+        if settings.problem or mosaic is None:  # the window is invalid while its second end is not typed yet
             return
         uid = mosaic.session_uid
-        for is_mosaic_made in images.showing_again(settings.display(), numbers):
+        for is_mosaic_made in images.recolor_images(settings.display(), numbers):
             yield
             mosaic = bpy.data.images.get(ids.MOSAIC)
-            _asked |= mosaic is None or mosaic.session_uid != uid  # another run is shown
-            if _asked and (is_mosaic_made or mosaic is None or mosaic.session_uid != uid):
+            _is_requested |= mosaic is None or mosaic.session_uid != uid  # another run may be shown
+            if _is_requested and (is_mosaic_made or mosaic is None or mosaic.session_uid != uid):
                 break
         else:
-            planes.update(bpy.context.scene)  # the pictures' sizes may be others now
+            planes.update(bpy.context.scene)  # the pictures' sizes may have changed
 
 
-def _turn() -> float | None:
-    """Do some steps; later the next."""
+def _take_turn() -> float | None:
+    """Do some steps; return the seconds until the next turn, None when done."""
     global _steps
     _steps = _steps or recoloring()
-    enough = time.perf_counter() + _STEP
-    while time.perf_counter() < enough:
+    deadline = time.perf_counter() + _TURN_TIME
+    while time.perf_counter() < deadline:
         try:
             next(_steps)
         except StopIteration:

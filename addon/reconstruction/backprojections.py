@@ -14,13 +14,13 @@ from ..volumes import slices, stored_volumes, volumes
 from .reconstruction_properties import HOW_LABELS
 
 
-def backprojecting(context: bpy.types.Context, recipe: Recipe, how: str) -> jobs.Job:
-    """The job that back-projects the scene's shown run onto the voxels of `recipe`, as a new volume with slices.
+def backproject_job(context: bpy.types.Context, recipe: Recipe, how: str) -> jobs.Job:
+    """Return the job that back-projects the scene's shown run onto the voxels of `recipe`, as a new volume with slices.
 
-    `how` is one of those of `core.perspective.backprojection`. Raises InputError where no run is shown.
+    `how` is one of the combinations in `core.perspective.backprojection`. Raises InputError where no run is shown.
     """
-    scene, shown = context.scene, runs.required(context.scene, "back-project")
-    path, name, folder, uid = rendering.file_of(shown.file), shown.name, storage.folder(), scene.session_uid
+    scene, run_item = context.scene, runs.required_run(context.scene, "back-project")
+    path, name, folder, uid = rendering.run_file_path(run_item.file), run_item.name, storage.folder(), scene.session_uid
     label, start = HOW_LABELS[how], time.perf_counter()
 
     def work(progress: Progress) -> stored_volumes.StoredVolume:
@@ -34,10 +34,10 @@ def backprojecting(context: bpy.types.Context, recipe: Recipe, how: str) -> jobs
         return stored_volumes.store_volume(volume, folder, None, provenance)
 
     def finish(stored: stored_volumes.StoredVolume) -> str:
-        scene = jobs.scene_again(uid, "the back-projection is")
+        scene = jobs.require_scene(uid, "the back-projection is")
         item = volumes.add_stored(stored, f"{name} {label}", scene.collection)
         volumes.make_active(bpy.context, item)
-        slices.add_slices(item)  # it is somewhere everywhere: as smoke, a cloud
+        slices.add_slices(item)  # as smoke it would be a cloud: few of its voxels are 0
         seconds = time.perf_counter() - start
         return f"Back-projected {item.name!r}: {stored.low:.4g} to {stored.high:.4g}, in {seconds:.1f} s"
 

@@ -1,4 +1,4 @@
-"""The Reconstruction panel's settings: Blender properties made from `core.runs.settings`, and what they say."""
+"""Settings of the Reconstruction panel: Blender properties made from `core.runs.settings`, and the recipe in them."""
 
 from __future__ import annotations
 
@@ -15,88 +15,88 @@ from ...core.runs.recipe import Recipe, fitting_recipe
 from ...core.runs.settings import SETTINGS
 from ..blender import choices
 from ..blender.file_properties import path_property
-from ..blender.setting_properties import drawn_of, properties_of, unset_of, values_of
+from ..blender.setting_properties import make_check_marks, make_properties, properties_to_draw, read_values
 from ..volumes import volumes
 
 _BY_COMMAND_LINE = ("anatomy", "allow", "stop_change", "stop_noise", "stop_region", "stop_seconds")
-"""Settings that the panel does not have: of files, and of ends that Finish Now is for."""
+"""Settings that the panel lacks: files, and stopping criteria, in place of which there is Finish Now."""
 
 PROPERTIES = {
     key.partition(".")[2]: setting
     for key, setting in SETTINGS.items()
     if key.startswith("reconstruction.") and not key.endswith(_BY_COMMAND_LINE)
 }
-"""The settings by the names of their properties."""
+"""The panel's settings by property name."""
 
 
-_OF_VOXELS = ("voxels", "spacing", "center")
-_HOW = {
+_VOXEL_NAMES = ("voxels", "spacing", "center")
+_WAYS = {
     "sum": ("Sum", "Add up the views: large wherever many rays cross something"),
     "product": ("Geometric Mean", "Multiply the views: nothing where one view sees nothing"),
-    "minimum": ("Minimum", "The least that a view sees there"),
+    "minimum": ("Minimum", "The smallest value that a view has there"),
 }
-HOW_LABELS = {how: _HOW.get(how, (how.capitalize(), ""))[0] for how in HOW}
-"""What the ways to put views together are called."""
+HOW_LABELS = {how: _WAYS.get(how, (how.capitalize(), ""))[0] for how in HOW}
+"""Labels of the ways to combine views."""
 
 
 class ReconstructionSettings:
-    """How to reconstruct; mixed into the scene's properties (the panel) and into the operator (scripts)."""
+    """Properties for reconstructing, shared by the scene's settings (the panel) and the operator (scripts)."""
 
 
 _FILES = ", ".join(METHOD_FILES)
-ReconstructionSettings.__annotations__ = properties_of(PROPERTIES)
+ReconstructionSettings.__annotations__ = make_properties(PROPERTIES)
 ReconstructionSettings.__annotations__["method_file"] = path_property(
     "Method File", f"A trained network ({_FILES}) instead of the method; it has voxels of its own"
 )
-_OF_FILES = ("ignore_attenuation", "ignore_blur", "hole", "aperture_points", "pixel_points")
-"""Settings that matter to methods in files: of the model alone."""
+_METHOD_FILE_NAMES = ("ignore_attenuation", "ignore_blur", "hole", "aperture_points", "pixel_points")
+"""Settings of the model that also matter to methods in files."""
 
 
-_PUT_TOGETHER = EnumProperty(
-    name="Combine By", description="How the views that see a voxel are put together",
-    items=choices.items({}, ((how.upper(), HOW_LABELS[how], _HOW.get(how, ("", ""))[1]) for how in HOW)), default="SUM",
+_COMBINE_BY = EnumProperty(
+    name="Combine By", description="How the views of a voxel are combined",
+    items=choices.items({}, ((how.upper(), HOW_LABELS[how], _WAYS.get(how, ("", ""))[1]) for how in HOW)), default="SUM",
 )  # fmt: skip
 
 
 class BackprojectionSettings:
-    """How to back-project; mixed into the operator (scripts)."""
+    """Properties for back-projecting, of the operator (scripts)."""
 
 
-BackprojectionSettings.__annotations__ = properties_of({name: PROPERTIES[name] for name in _OF_VOXELS})
-BackprojectionSettings.__annotations__["how"] = _PUT_TOGETHER
+BackprojectionSettings.__annotations__ = make_properties({name: PROPERTIES[name] for name in _VOXEL_NAMES})
+BackprojectionSettings.__annotations__["how"] = _COMBINE_BY
 
 
 def voxels_recipe(get: Callable[[str], Any]) -> Recipe:
-    """The recipe's voxels alone; `get` gives a property's value."""
-    values = values_of({name: PROPERTIES[name] for name in _OF_VOXELS}, get)
+    """Return the recipe with the voxels alone; `get` returns a property's value by its name."""
+    values = read_values({name: PROPERTIES[name] for name in _VOXEL_NAMES}, get)
     return Recipe({key: value for key, value in values.items() if value is not None})
 
 
-def settings_recipe(get: Callable[[str], Any], is_given: Callable[[str], bool]) -> Recipe:
-    """The recipe's [reconstruction]; `get` gives a property's value, `is_given` whether a script has set it.
+def settings_recipe(get: Callable[[str], Any], is_set: Callable[[str], bool]) -> Recipe:
+    """Return the recipe's table [reconstruction]; `get` returns a property's value, `is_set` whether a script has set it.
 
-    Raises InputError where a setting that is given has no effect.
+    Raises InputError where a setting that a script has set has no effect.
     """
-    values = values_of(PROPERTIES, get)
-    given = [s.key for name, s in PROPERTIES.items() if is_given(name) and values[s.key] != s.default]
+    values = read_values(PROPERTIES, get)
+    set_keys = [s.key for name, s in PROPERTIES.items() if is_set(name) and values[s.key] != s.default]
     if file := get("method_file"):
-        kept = {*given, *(PROPERTIES[name].key for name in _OF_FILES)} - {"reconstruction.method"}
-        values = {key: value for key, value in values.items() if key in kept}
+        kept_keys = {*set_keys, *(PROPERTIES[name].key for name in _METHOD_FILE_NAMES)} - {"reconstruction.method"}
+        values = {key: value for key, value in values.items() if key in kept_keys}
         values["reconstruction.method"] = bpy.path.abspath(file)
-    return fitting_recipe(values, given)
+    return fitting_recipe(values, set_keys)
 
 
 def fit_method(settings: ReconstructionProperties, of_counts: bool) -> None:
-    """Choose the method by what the run holds, counts or line integrals, unless the user has chosen one."""
+    """Choose a method for the run's content, counts or line integrals, unless the user has chosen one."""
     is_free = not settings.is_property_set("method") or settings.method == settings.fitted
     if is_free and METHODS[settings.method.lower()].of_counts != of_counts:
         settings.method = settings.fitted = "OSEM" if of_counts else "CGLS"
 
 
-def drawn(settings: ReconstructionProperties) -> Iterator[tuple[str, bool]]:
-    """The properties that the chosen method and prior have, each with whether it has an effect."""
-    shown = {name: PROPERTIES[name] for name in _OF_FILES} if settings.method_file else PROPERTIES
-    yield from drawn_of(shown, settings, lambda need: True)
+def panel_properties(settings: ReconstructionProperties) -> Iterator[tuple[str, bool]]:
+    """Yield the properties that the chosen method and prior have, each with whether it has an effect."""
+    settings_shown = {name: PROPERTIES[name] for name in _METHOD_FILE_NAMES} if settings.method_file else PROPERTIES
+    yield from properties_to_draw(settings_shown, settings, lambda need: True)
     yield "method_file", True
 
 
@@ -112,17 +112,15 @@ class ReconstructionProperties(ReconstructionSettings, bpy.types.PropertyGroup):
         "that which the run was made with; empty: the run's", type=bpy.types.Object,
         poll=lambda self, item: volumes.is_volume(item) and volumes.quantity_of(item) in ("mu", "hu"),
     )  # fmt: skip
-    fitted: StringProperty(
-        name="Fitted Method", description="The method that what a run holds has chosen", options={"HIDDEN"}
-    )
-    record: StringProperty(name="Record", description="What is known of it, JSON", options={"HIDDEN"})
+    fitted: StringProperty(name="Fitted Method", description="Method chosen for the run's content", options={"HIDDEN"})
+    record: StringProperty(name="Record", description="Details of the last reconstruction, JSON", options={"HIDDEN"})
 
     @property
-    def known(self) -> Mapping[str, Any]:
-        """What is known of the last reconstruction: `title`, `objective`, its `name`, `scores`, `flatters` and its `run`."""
+    def details(self) -> Mapping[str, Any]:
+        """Details of the last reconstruction: `title`, `objective`, its `name`, `scores`, `flatters` and its `run`."""
         return json.loads(self.record) if self.record else {}
 
 
-ReconstructionProperties.__annotations__.update(unset_of(PROPERTIES), how=_PUT_TOGETHER)
+ReconstructionProperties.__annotations__.update(make_check_marks(PROPERTIES), how=_COMBINE_BY)
 
 CLASSES = (ReconstructionProperties,)

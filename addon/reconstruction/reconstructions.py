@@ -1,4 +1,4 @@
-"""Reconstructions in the scene: a job whose volume is shown, and made anew, while it runs."""
+"""Reconstructions in the scene: jobs whose volume is shown, and updated, while they run."""
 
 import json
 import threading
@@ -39,180 +39,182 @@ from ..pictures import images
 from ..runs import rendering, runs
 from ..volumes import slices, stored_volumes, volume_materials, volumes
 
-_BETWEEN = 2.0  # s at least between two pictures of a reconstruction that runs
-_PNG_LEVEL = 1  # fast
+_MIN_INTERVAL = 2.0  # s between two pictures of a running reconstruction
+_PNG_LEVEL = 1  # fast compression
 _TEXT = 14.0  # size of text in a picture that fills an editor, pixels at a resolution scale of 1
-MORE = 10
-"""Iterations that Continue does."""
+MORE_ITERATIONS = 10
+"""Number of iterations that Continue does."""
 
 
 @dataclass(frozen=True)
-class _Shown:
-    """What the scene shows of a reconstruction."""
+class _ShownState:
+    """State of a reconstruction for display in the scene."""
 
     stored: stored_volumes.StoredVolume
-    picture: bytes  # PNG: slices, beside the truth, and the objective
-    record: dict[str, Any]  # see `ReconstructionProperties.known`
+    picture: bytes  # PNG of slices, beside the truth if there is one, and the objective
+    record: dict[str, Any]  # see `ReconstructionProperties.details`
 
 
 @dataclass(frozen=True)
-class _Last:
-    """A reconstruction to go on with."""
+class _PreviousResult:
+    """Reconstruction to be continued."""
 
-    item: int  # its object's `session_uid`
-    found: Reconstruction
+    item: int  # `session_uid` of its object
+    reconstruction: Reconstruction
     stored: stored_volumes.StoredVolume
 
 
-def resumable(context: bpy.types.Context) -> Path | None:
-    """The file from which Continue goes on: of the panel's reconstruction, if it was made by iterations."""
+def resume_path(context: bpy.types.Context) -> Path | None:
+    """Return the file from which Continue goes on, for the panel's reconstruction; None if it was not made by iterations."""
     item = context.scene.mphdrr_reconstruction.volume
-    path = None if item is None else storage.resumable(volumes.file_of(item))
+    path = None if item is None else storage.resume_file(volumes.file_of(item))
     return path if path is not None and path.is_file() else None
 
 
-def reconstructing(context: bpy.types.Context, recipe: Recipe) -> jobs.Job:
-    """The job that reconstructs the scene's shown run as the [reconstruction] of `recipe` says; raises InputError.
+def reconstruct_job(context: bpy.types.Context, recipe: Recipe) -> jobs.Job:
+    """Return the job that reconstructs the scene's shown run by the table [reconstruction] of `recipe`; raise `InputError`.
 
-    The volume comes into the scene with the first iteration that is shown. The object of an earlier reconstruction stays.
+    The volume appears in the scene with the first iteration that is shown. The object of an earlier reconstruction stays.
     """
-    run = runs.required(context.scene, "reconstruct")
-    return _reconstructing(context, recipe, rendering.file_of(run.file), run.name)
+    run = runs.required_run(context.scene, "reconstruct")
+    return _make_job(context, recipe, rendering.run_file_path(run.file), run.name)
 
 
-def continuing(context: bpy.types.Context) -> jobs.Job:
-    """The job that does some more iterations of the reconstruction in the panel, in the same object; raises InputError."""
-    settings, path = context.scene.mphdrr_reconstruction, resumable(context)
+def continue_job(context: bpy.types.Context) -> jobs.Job:
+    """Return the job that does further iterations of the panel's reconstruction, in the same object; raise `InputError`."""
+    settings, path = context.scene.mphdrr_reconstruction, resume_path(context)
     if path is None:
         raise InputError("nothing to continue: reconstruct first, by iterations")
-    item, file, found = settings.volume, settings.known["run"], read_reconstruction(path)
+    item, file, reconstruction = settings.volume, settings.details["run"], read_reconstruction(path)
     run = next((run for run in context.scene.mphdrr_projections.runs if storage.absolute(run.file).name == file), None)
     if run is None:
         raise InputError(f"the run that it is of ({file}) has left the list of runs: reconstruct again")
-    values, extent = found.volume.array, item.mphdrr_volume.extent
-    before = stored_volumes.StoredVolume(
-        (found.volume,), volumes.pose_of_object(item), storage.absolute(item.data.filepath),
+    values, extent = reconstruction.volume.array, item.mphdrr_volume.extent
+    stored = stored_volumes.StoredVolume(
+        (reconstruction.volume,), volumes.pose_of_object(item), storage.absolute(item.data.filepath),
         float(values.min()), float(values.max()), extent,
     )  # fmt: skip
-    recipe = recipe_of_tables(found.settings["recipe"]).updated({"reconstruction.iterations": MORE})
-    last = _Last(item.session_uid, found, before)
-    return _reconstructing(context, recipe, rendering.file_of(run.file), run.name, last)
+    recipe = recipe_of_tables(reconstruction.settings["recipe"]).updated({"reconstruction.iterations": MORE_ITERATIONS})
+    previous = _PreviousResult(item.session_uid, reconstruction, stored)
+    return _make_job(context, recipe, rendering.run_file_path(run.file), run.name, previous)
 
 
-def _reconstructing(
-    context: bpy.types.Context, recipe: Recipe, path: Path, name: str, last: _Last | None = None
+def _make_job(
+    context: bpy.types.Context, recipe: Recipe, path: Path, name: str, previous: _PreviousResult | None = None
 ) -> jobs.Job:
+    """Return the job that reconstructs the run in the file `path`, from the start or on from a previous result."""
     scene, folder = context.scene, storage.folder()
     method = method_of(recipe["reconstruction.method"])
-    readers, instead = _readers_of_mu(scene), scene.mphdrr_reconstruction.mu
-    own_mu = instead.name if instead in volumes.volume_objects(scene) else None
+    readers, panel_mu = _mu_readers(scene), scene.mphdrr_reconstruction.mu
+    mu_name = panel_mu.name if panel_mu in volumes.volume_objects(scene) else None
     uid, start = scene.session_uid, time.perf_counter()
-    is_watched = windows.has_window()
-    if is_watched:
+    has_window = windows.has_window()
+    if has_window:
         images.open_editor(context)
-    shelf = _Shelf(context, f"{name} {method.label}", last)
+    live = _LiveResult(context, f"{name} {method.label}", previous)
 
-    def work(progress: Progress) -> tuple[_Shown, Reconstruction]:
+    def work(progress: Progress) -> tuple[_ShownState, Reconstruction]:
         stages = stages_of(progress)
         stages("reading the run")
         run = read_run(path)
-        grid = reconstruction_grid(run, recipe, method)  # refuses what cannot be, before the work begins
-        before = 0.0
+        grid = reconstruction_grid(run, recipe, method)  # raises its errors before the work begins
+        last_shown = 0.0
 
-        def shown_of(
+        def make_state(
             values: NDArray[Any], objective: Sequence[float], scores: Mapping[str, Any] = {}, flatters: Any = ()
-        ) -> _Shown:
+        ) -> _ShownState:
             volume = Volume(values, grid, "activity" if run.volume is None else run.volume.quantity)
             record = {
                 "title": ", ".join(filter(None, (method.label, iterations_text(len(objective))))),
                 "name": method.objective, "objective": list(objective), "voxels": voxels_text(grid),
                 "scores": [], "rods": [], "flatters": flatters, **scores, "run": path.name,
             }  # fmt: skip
-            picture = _picture(run, volume, record, name, shelf.room)
+            picture = _draw_picture(run, volume, record, name, live.editor_size)
             stored = stored_volumes.store_volume(volume, folder, None, {"reconstruction_of": name, **recipe.tables()})
-            shelf.files.append(stored.path)
-            return _Shown(stored, picture, record)
+            live.files.append(stored.path)
+            return _ShownState(stored, picture, record)
 
         def watch(iteration: int, values: NDArray[Any], objective: Sequence[float]) -> bool:
-            nonlocal before
-            if time.monotonic() - before > _BETWEEN and is_watched:
-                shelf.latest = shown_of(np.array(values), objective)
-                before = time.monotonic()
-            return shelf.enough.is_set()
+            nonlocal last_shown
+            if time.monotonic() - last_shown > _MIN_INTERVAL and has_window:
+                live.unshown = make_state(np.array(values), objective)
+                last_shown = time.monotonic()
+            return live.finish_now.is_set()
 
-        mu = _mu(run, recipe, readers, own_mu)
-        found = reconstruct_run(run, recipe, mu, last.found if last else None, watch, stages, method)
-        scores = _scores(run, found.volume, stages("scoring"))
-        shown = shown_of(found.volume.array, found.objective.tolist(), scores, found.settings["flatters"])
-        if found.iterations:
-            shelf.files.append(storage.resumable(shown.stored.path))
-            write_reconstruction(found, shelf.files[-1])
-        return shown, found
+        mu = _read_mu(run, recipe, readers, mu_name)
+        old_result = previous.reconstruction if previous else None
+        result = reconstruct_run(run, recipe, mu, old_result, watch, stages, method)
+        scores = _scores(run, result.volume, stages("scoring"))
+        state = make_state(result.volume.array, result.objective.tolist(), scores, result.settings["flatters"])
+        if result.iterations:
+            live.files.append(storage.resume_file(state.stored.path))
+            write_reconstruction(result, live.files[-1])
+        return state, result
 
-    def finish(result: tuple[_Shown, Reconstruction]) -> str:
-        jobs.scene_again(uid, "the reconstruction is")  # or an error
-        shown, found = result
-        item = shelf.show(shown)
+    def finish(result: tuple[_ShownState, Reconstruction]) -> str:
+        jobs.require_scene(uid, "the reconstruction is")
+        state, reconstruction = result
+        item = live.show(state)
         volumes.make_active(bpy.context, item)
-        slices.add_slices(item, full_slices(found.volume.array).tolist())
+        slices.add_slices(item, full_slices(reconstruction.volume.array).tolist())
         images.show_below(bpy.data.images[ids.RECONSTRUCTION], bpy.context)
-        shelf.tidy()
+        live.tidy()
         seconds = time.perf_counter() - start
-        return f"Reconstructed {item.name!r}: {shown.record['title']}, {shown.record['voxels']}, in {seconds:.1f} s"
+        return f"Reconstructed {item.name!r}: {state.record['title']}, {state.record['voxels']}, in {seconds:.1f} s"
 
-    return jobs.Job("Reconstructing", work, finish, shelf.clear, shelf.look, shelf.enough)
+    return jobs.Job("Reconstructing", work, finish, live.clear, live.refresh, live.finish_now)
 
 
-class _Shelf:
-    """What a running reconstruction has put into the scene and on the disk, to be replaced, or taken back."""
+class _LiveResult:
+    """Scene objects and files of a running reconstruction; updated after iterations, removed if the user cancels."""
 
-    def __init__(self, context: bpy.types.Context, name: str, last: _Last | None) -> None:
-        self.name, self.enough, self._last = name, threading.Event(), last
+    def __init__(self, context: bpy.types.Context, name: str, previous: _PreviousResult | None) -> None:
+        self.name, self.finish_now, self._previous = name, threading.Event(), previous
         self.files: list[Path] = []
-        self.latest: _Shown | None = None  # made by the thread
-        self.room = images.room(context) if windows.has_window() else None  # that the picture fills
+        self.unshown: _ShownState | None = None  # latest state of the worker thread, which is not shown yet
+        self.editor_size = images.editor_size(context) if windows.has_window() else None  # room for the picture
         scene = context.scene
         settings = scene.mphdrr_reconstruction
-        self._scene, self._item, self._is_shown = scene.session_uid, last.item if last else 0, False
-        self._hidden: list[int] = []  # the truth, and an earlier reconstruction
-        self._before = settings.volume, settings.record
+        self._scene, self._item, self._is_shown = scene.session_uid, previous.item if previous else 0, False
+        self._hidden: list[int] = []  # `session_uid` of hidden objects: the truth, an earlier reconstruction
+        self._old_record = settings.volume, settings.record
         image = bpy.data.images.get(ids.RECONSTRUCTION)
         packed = None if image is None else image.packed_file
-        self._picture = None if packed is None else bytes(packed.data)
+        self._old_picture = None if packed is None else bytes(packed.data)
 
-    def look(self) -> None:
-        """Show what the thread has made since."""
-        self.room = images.room(bpy.context)
-        latest, self.latest = self.latest, None
-        if latest is not None:
+    def refresh(self) -> None:
+        """Show the latest state of the worker thread."""
+        self.editor_size = images.editor_size(bpy.context)
+        state, self.unshown = self.unshown, None
+        if state is not None:
             is_first = not self._is_shown
-            self.show(latest)
+            self.show(state)
             if is_first:
                 images.show_below(bpy.data.images[ids.RECONSTRUCTION], bpy.context)
 
-    def show(self, shown: _Shown) -> bpy.types.Object:
-        """Put a state of the reconstruction into the scene, in place of the one before."""
-        scene = jobs.found_again(bpy.data.scenes, self._scene)
-        item = jobs.found_again(bpy.data.objects, self._item)
+    def show(self, state: _ShownState) -> bpy.types.Object:
+        """Put a state of the reconstruction into the scene, in place of the previous one, and return its object."""
+        scene = jobs.find_by_uid(bpy.data.scenes, self._scene)
+        item = jobs.find_by_uid(bpy.data.objects, self._item)
         if not self._is_shown:
             self._is_shown = True
-            self._hide(runs.projected(scene), scene.mphdrr_reconstruction.volume if item is None else None)
-        if item is None:  # or the user has deleted it
-            item = volumes.add_stored(shown.stored, self.name, scene.collection)
+            self._hide(runs.projected_volume(scene), scene.mphdrr_reconstruction.volume if item is None else None)
+        if item is None:  # first state, or the user has deleted the object
+            item = volumes.add_stored(state.stored, self.name, scene.collection)
             self._item = item.session_uid
         else:
-            volumes.replace_stored(item, shown.stored)
-        factor = volume_materials.shown_unit(item.mphdrr_volume.quantity)[1]
-        bright = factor * bright_value(shown.stored.volume.array)
-        if bright > 0:  # the hottest voxel does not say how bright the others are
-            item.mphdrr_volume.display_high = bright
-        images.store_drawn(ids.RECONSTRUCTION, shown.picture)
+            volumes.replace_stored(item, state.stored)
+        factor = volume_materials.display_unit(item.mphdrr_volume.quantity)[1]
+        bright_end = factor * bright_value(state.stored.volume.array)
+        if bright_end > 0:  # a single hot voxel would make all others dark
+            item.mphdrr_volume.display_high = bright_end
+        images.store_png(ids.RECONSTRUCTION, state.picture)
         settings = scene.mphdrr_reconstruction
-        settings.volume, settings.record = item, json.dumps(shown.record)
+        settings.volume, settings.record = item, json.dumps(state.record)
         return item
 
     def _hide(self, *items: bpy.types.Object | None) -> None:
-        """Hide what stands where the reconstruction is; the eye beside its name brings it back."""
+        """Hide the objects that stand where the reconstruction is; the eye beside their names shows them again."""
         for item in items:
             if item is not None and item.name in bpy.context.view_layer.objects and not item.hide_get():
                 item.hide_set(True)
@@ -226,24 +228,24 @@ class _Shelf:
                 path.unlink(missing_ok=True)
 
     def clear(self) -> None:
-        """Take everything back."""
-        item = jobs.found_again(bpy.data.objects, self._item)
-        for hidden in filter(None, (jobs.found_again(bpy.data.objects, uid) for uid in self._hidden)):
+        """Restore scene and files as they were before the job."""
+        item = jobs.find_by_uid(bpy.data.objects, self._item)
+        for hidden in filter(None, (jobs.find_by_uid(bpy.data.objects, uid) for uid in self._hidden)):
             hidden.hide_set(False)
-        if item is not None and self._last is not None:
-            volumes.replace_stored(item, self._last.stored)
+        if item is not None and self._previous is not None:
+            volumes.replace_stored(item, self._previous.stored)
         elif item is not None:
             materials = list(item.data.materials)
             objects.remove_objects([item, *item.children])
             objects.remove_unused(materials)
-        scene = jobs.found_again(bpy.data.scenes, self._scene)
+        scene = jobs.find_by_uid(bpy.data.scenes, self._scene)
         if scene is not None and self._is_shown:
             settings = scene.mphdrr_reconstruction
             with suppress(ReferenceError):
-                settings.volume, settings.record = self._before
+                settings.volume, settings.record = self._old_record
             image = bpy.data.images.get(ids.RECONSTRUCTION)
-            if self._picture is not None:
-                images.store_drawn(ids.RECONSTRUCTION, self._picture)
+            if self._old_picture is not None:
+                images.store_png(ids.RECONSTRUCTION, self._old_picture)
             elif image is not None:
                 bpy.data.images.remove(image)
         self.tidy()
@@ -267,34 +269,34 @@ def _scores(run: ProjectionRun, volume: Volume, progress: Progress | None) -> di
     return {"scores": lines, "rods": [sector.cells for sector in score.derenzo or () if sector.rod_diameter]}
 
 
-def _picture(
-    run: ProjectionRun, volume: Volume, record: dict[str, Any], name: str, room: tuple[int, int, float] | None
+def _draw_picture(
+    run: ProjectionRun, volume: Volume, record: dict[str, Any], name: str, editor_size: tuple[int, int, float] | None
 ) -> bytes:
-    """A picture that fills its editor's room, if there is one: width and height, pixels, and Blender's scale of texts."""
+    """Return a PNG of slices and objective that fills an editor: width and height, pixels, and Blender's scale of texts."""
     page = Page(*(SIZE if run.volume is None else SIZE_BESIDE_TRUTH), DARK)
-    if room is not None and min(room[:2]) >= SMALLEST:
-        page = Page(*room[:2], DARK, _TEXT * room[2])
+    if editor_size is not None and min(editor_size[:2]) >= SMALLEST:
+        page = Page(*editor_size[:2], DARK, _TEXT * editor_size[2])
     line = ", ".join([record["title"], *map(" ".join, record["scores"][:1]), record["voxels"]])
     lines, title = [line, *record["flatters"]], f"Reconstruction of {name}"
     draw(page, volume, record["objective"], run.volume, title, lines, record["name"], record["rods"])
     return png(page.picture, _PNG_LEVEL)
 
 
-def _readers_of_mu(scene: bpy.types.Scene) -> dict[str, Callable[[], Volume]]:
-    """What reads each attenuation of the scene, by its object's name, in a thread."""
-    found = {}
+def _mu_readers(scene: bpy.types.Scene) -> dict[str, Callable[[], Volume]]:
+    """Return a function that reads each attenuation of the scene in a worker thread, by its object's name."""
+    readers = {}
     for item in volumes.volume_objects(scene):
         if volumes.quantity_of(item) in ("mu", "hu"):
-            with suppress(InputError):  # its file is gone; another one may be meant
-                found[item.name] = volumes.reader(item)
-    return found
+            with suppress(InputError):  # its file is gone, but another attenuation may be needed
+                readers[item.name] = volumes.reader(item)
+    return readers
 
 
-def _mu(
-    run: ProjectionRun, recipe: Recipe, readers: Mapping[str, Callable[[], Volume]], instead: str | None
+def _read_mu(
+    run: ProjectionRun, recipe: Recipe, readers: Mapping[str, Callable[[], Volume]], mu_name: str | None
 ) -> Volume | None:
-    """The attenuation `instead` of the run's, or of a run's object of the scene; None of others, which the run knows."""
-    name = run.recipe["attenuation.object"] if instead is None else instead
+    """Return the attenuation `mu_name`, by default that of the run's recipe, if it is an object of the scene; else None."""
+    name = run.recipe["attenuation.object"] if mu_name is None else mu_name
     if name is None or run.recipe["model.kind"] != "emission" or recipe["reconstruction.ignore_attenuation"]:
         return None
     if name not in readers:

@@ -1,4 +1,4 @@
-"""Calibration in the window: modules move to where images of point sources have them."""
+"""Calibration in the window: modules move to the positions fitted to images of point sources."""
 
 import json
 from pathlib import Path
@@ -15,55 +15,56 @@ from ..blender import ids, jobs
 from ..pictures import images
 from ..scanner import arrows, module_edits, scanner
 
-_FAR = 25.0  # mm: a module that is as far from the recipe's is another scanner's
+_MAX_DISTANCE = 25.0  # mm from the recipe's position; a module farther away belongs to another scanner
 
 
-def calibrating(context: bpy.types.Context, path: Path, apply: bool = True, exaggeration: float = 0.0) -> jobs.Job:
-    """The job that calibrates the active scanner as a recipe (.toml) says, by the same numbers as `run_calibration`.
+def calibrate_job(context: bpy.types.Context, path: Path, apply: bool = True, exaggeration: float = 0.0) -> jobs.Job:
+    """Return the job that calibrates the active scanner by a recipe (.toml), with the same numbers as `run_calibration`.
 
-    With `apply` the modules move and turn to what is found. Arrows lead from nominal to found pinholes, `exaggeration`
-    times as long, or, if 0, the longest about 50 mm. Modules that do not fit are marked. Raises InputError where there is no
-    scanner of pinholes.
+    With `apply` the modules move and turn to the result. Arrows lead from nominal to calibrated pinholes, `exaggeration`
+    times as long, or, if 0, the longest about 50 mm. Modules that do not fit are marked. Raises InputError where there is
+    no scanner with pinholes.
     """
     collection = scanner.required_scanner(context.scene)
-    scanner.read_pinholes(collection)  # or an error before the work begins
+    scanner.read_pinholes(collection)  # raises its error before the work begins
     uid = collection.session_uid
 
     def work(progress: Progress) -> tuple[Calibration, bytes]:
-        found = run_calibration(path, progress)
-        return found, png(found.residual_sheet().picture)
+        calibration = run_calibration(path, progress)
+        return calibration, png(calibration.residual_sheet().picture)
 
     def finish(result: tuple[Calibration, bytes]) -> str:
-        found, picture = result
-        collection = jobs.found_again(bpy.data.collections, uid)
+        calibration, picture = result
+        collection = jobs.find_by_uid(bpy.data.collections, uid)
         if collection is None:
             raise InputError("the scanner that was calibrated is gone")
-        _require_same(collection, found)
+        _require_same_scanner(collection, calibration)
         if apply:
-            module_edits.move_to(collection, found.system)
-        factor = arrows.show(collection, found.nominal.centers, found.system.centers, exaggeration)
-        lines = [*found.summary(), *([f"arrows: {factor:g} times the shift"] if factor else [])]
+            module_edits.move_modules(collection, calibration.system)
+        factor = arrows.show(collection, calibration.nominal.centers, calibration.system.centers, exaggeration)
+        lines = [*calibration.summary(), *([f"arrows: {factor:g} times the shift"] if factor else [])]
         collection.mphdrr_scanner.calibration = json.dumps(lines)
-        _mark_misfits(collection, found)
-        images.show_below(images.store_drawn(ids.RESIDUALS, picture), bpy.context)
+        _mark_misfits(collection, calibration)
+        images.show_below(images.store_png(ids.RESIDUALS, picture), bpy.context)
         return f"{'Calibrated' if apply else 'Not applied'}: {'; '.join(lines[:3])}"
 
     return jobs.Job("Calibrating", work, finish)
 
 
-def _require_same(collection: bpy.types.Collection, found: Calibration) -> None:
-    """Refuse a recipe of another scanner: its modules, or their places, are others."""
+def _require_same_scanner(collection: bpy.types.Collection, calibration: Calibration) -> None:
+    """Raise `InputError` for a recipe of another scanner, which has other module numbers or positions."""
     system = scanner.read_pinholes(collection)
-    places = dict(zip(system.numbers.tolist(), system.centers, strict=True))
-    for number, *known in zip(found.system.numbers.tolist(), found.nominal.centers, found.system.centers, strict=True):
-        if number not in places or np.linalg.norm(known - places[number], axis=1).min() > _FAR:
-            where = f"module {number} within {_FAR:g} mm of where the recipe has it"
-            raise InputError(f"scanner '{collection.name}' has no {where}: choose the recipe's scanner")
+    positions = dict(zip(system.numbers.tolist(), system.centers, strict=True))
+    nominal, fitted = calibration.nominal.centers, calibration.system.centers
+    for number, *pair in zip(calibration.system.numbers.tolist(), nominal, fitted, strict=True):
+        if number not in positions or np.linalg.norm(pair - positions[number], axis=1).min() > _MAX_DISTANCE:
+            expected = f"module {number} within {_MAX_DISTANCE:g} mm of where the recipe has it"
+            raise InputError(f"scanner '{collection.name}' has no {expected}: choose the recipe's scanner")
 
 
-def _mark_misfits(collection: bpy.types.Collection, found: Calibration) -> None:
+def _mark_misfits(collection: bpy.types.Collection, calibration: Calibration) -> None:
     """Note at each module whether it fits."""
-    for number, misfit in zip(found.system.numbers.tolist(), found.misfit.tolist(), strict=True):
-        why = f"misfit {misfit:.1f}, where 1 is usual" if np.isfinite(misfit) else "its images fit no place nearby"
-        text = f"Does not fit its calibration: {why}" if number in found.misfitting else ""
+    for number, misfit in zip(calibration.system.numbers.tolist(), calibration.misfit.tolist(), strict=True):
+        reason = f"misfit {misfit:.1f}, where 1 is usual" if np.isfinite(misfit) else "its images fit no place nearby"
+        text = f"Does not fit its calibration: {reason}" if number in calibration.misfitting else ""
         scanner.module(collection, number).mphdrr_module.finding = text

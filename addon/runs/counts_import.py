@@ -1,4 +1,4 @@
-"""Measured counts of a real or another simulator's scanner become a run of the scene's scanner."""
+"""Import of measured counts, of a real scanner or another simulator, as a run of the scene's scanner."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -17,46 +17,45 @@ from ..pictures import images
 from ..scanner import scanner
 from . import rendering, runs
 
-_OF_FRAMES = (
+_UNSET_KEYS = (
     *("detector.rows", "detector.columns", "detector.plane", "detector.magnification", "detector.pitch"),
     *("frames.times", "frames.starts"),
 )
 
 
-def importing(context: bpy.types.Context, paths: list[Path], given: Mapping[str, Any]) -> jobs.Job:
-    """The job that reads measured counts as the run of the scene's scanner.
+def import_counts_job(context: bpy.types.Context, paths: list[Path], entries: Mapping[str, Any]) -> jobs.Job:
+    """Return the job that reads measured counts as a run of the scene's scanner.
 
-    `given` are entries of a recipe: of its table ``counts``, the time, the pixel size, the modules. The rest of the model,
-    such as isotope, aperture and attenuation, which a reconstruction needs, is the panel's. Raises InputError where there
-    is no scanner.
+    `entries` are recipe entries of the table ``counts``, the time, the pixel size, the modules. The rest of the model, such
+    as isotope, aperture and attenuation, which a reconstruction needs, is the panel's. Raises InputError without a scanner.
     """
     if not paths:
         raise InputError("no file given: set filepath to a file with counts")
     scene = context.scene
     collection = scanner.required_scanner(scene)
     recipe = runs.panel_recipe(scene)
-    if (mu := rendering.attenuating(context, recipe)) is not None:
-        phantoms.require_current(mu)
+    if (mu_item := rendering.attenuating_object(context, recipe)) is not None:
+        phantoms.require_current(mu_item)
     recipe = recipe.updated(
-        {**dict.fromkeys(_OF_FRAMES), "model.time": None, "attenuation.object": mu and mu.name}
+        {**dict.fromkeys(_UNSET_KEYS), "model.time": None, "attenuation.object": mu_item and mu_item.name}
         | {"model.kind": "emission", "counts.files": [str(path) for path in paths]}
-        | dict(given)
+        | dict(entries)
     )
     system = chosen_modules(scanner.read_scanner(collection), recipe["system.modules"], "modules")
-    path, display = rendering.run_path(scene), scene.mphdrr_display.display()
+    path, display = rendering.new_run_path(scene), scene.mphdrr_display.display()
     scene_uid, scanner_uid = scene.session_uid, collection.session_uid
 
     def work(progress: Progress) -> tuple[ProjectionRun, images.Pictures]:
         stages = stages_of(progress)
         run = recipe_counts(recipe, system, stages)
-        return run, rendering.kept(run, path, display, stages)
+        return run, rendering.write_and_draw(run, path, display, stages)
 
     def finish(result: tuple[ProjectionRun, images.Pictures]) -> jobs.Finishing:
-        run, made = result
-        scene = jobs.scene_again(scene_uid, "the projections are")
-        owner = jobs.found_again(bpy.data.collections, scanner_uid)
-        state = runs.state_of(system, run.recipe, None, None) | {"measured": caption(run)}
-        images.show_below((yield from rendering.storing(scene, run, path, state, owner, made)), bpy.context)
+        run, pictures = result
+        scene = jobs.require_scene(scene_uid, "the projections are")
+        owner = jobs.find_by_uid(bpy.data.collections, scanner_uid)
+        state = runs.scene_state(system, run.recipe, None, None) | {"measured": caption(run)}
+        images.show_below((yield from rendering.store_and_show(scene, run, path, state, owner, pictures)), bpy.context)
         return (
             f"Imported {float(run.projections.sum(dtype=float)):.6g} counts of {len(run.views)} modules: {caption(run)}"
         )

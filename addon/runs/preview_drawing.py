@@ -1,4 +1,4 @@
-"""The live preview's picture in the 3D views: in a box that can be dragged, and where the module's plane stands.
+"""Picture of the live preview in the 3D views: in a box that can be dragged, and where the module's plane stands.
 
 It is drawn over the views and is no datablock: nothing of it is saved, undone or rendered.
 """
@@ -16,19 +16,21 @@ from numpy.typing import NDArray
 from ...core.runs.letters import wrapped
 from ..blender import windows
 
-_WIDTH, _LEAST = 150.0, 60.0  # of the picture in the box, and its least height, in Blender's units of its interface
-_ABOVE, _BESIDE = 130.0, 50.0  # in such units: for the gizmos that turn the view, above the picture and beside it
+# Lengths in units of Blender's interface: width and smallest height of the picture; free space above and beside it for the
+# gizmos that turn the view; margin of the box, and size of its letters.
+_WIDTH, _MIN_HEIGHT = 150.0, 60.0
+_ABOVE, _BESIDE = 130.0, 50.0
 _MARGIN, _TEXT = 20.0, 11.0
 _BACK, _FRONT = (0.05, 0.05, 0.05, 0.75), (1.0, 1.0, 1.0, 1.0)
 _TRIANGLES = ((0, 1, 2), (0, 2, 3))
 
 _Pair = tuple[float, float]
 _boxes: dict[int, tuple[tuple[float, float, float, float], _Pair]] = {}
-"""By 3D view: left, bottom, right and top of the box, and how far it can go to the right and up, pixels of the region."""
+"""Box (left, bottom, right, top) and its range of motion to the right and up, pixels of the region, by 3D view."""
 
 
 def start(session: Any) -> Callable[[], None]:
-    """Draw the preview of a `preview.Session` from now on; the result takes it back."""
+    """Draw the preview of a `preview.Session` from now on; return a function that ends the drawing."""
     if bpy.app.background:
         return lambda: None
     view = bpy.types.SpaceView3D
@@ -47,33 +49,34 @@ def start(session: Any) -> Callable[[], None]:
 
 
 def is_over(region: bpy.types.Region, x: float, y: float) -> bool:
-    """Whether a pixel of a 3D view is in the box."""
+    """Return whether a pixel of a 3D view is in the box."""
     (left, bottom, right, top), _ = _boxes.get(region.as_pointer(), ((0.0,) * 4, (0.0, 0.0)))
     return left <= x < right and bottom <= y < top
 
 
 def outline(region: bpy.types.Region) -> None:
-    """Frame the box, which the mouse is over."""
+    """Draw a frame around the box while the mouse is over it."""
     left, bottom, right, top = _boxes[region.as_pointer()][0]
     frame = _box(left, bottom, right, top)
     windows.draw_lines([*frame, frame[0]], _FRONT, 1.0, "LINE_STRIP")
 
 
 def drag(context: bpy.types.Context, start: _Pair, pixels: _Pair) -> None:
-    """Put the box, which was at the `start` of its ways, so many pixels further to the right and up."""
-    room = _boxes[context.region.as_pointer()][1]
-    place = [min(1.0, max(0.0, a + b / max(c, 1.0))) for a, b, c in zip(start, pixels, room, strict=True)]
-    context.scene.mphdrr_display.preview_place = place
+    """Move the box, which was at `start` (0 to 1 of its ranges), by so many pixels to the right and up."""
+    range_ = _boxes[context.region.as_pointer()][1]
+    position = [min(1.0, max(0.0, a + b / max(c, 1.0))) for a, b, c in zip(start, pixels, range_, strict=True)]
+    context.scene.mphdrr_display.preview_place = position
     windows.redraw("VIEW_3D")
 
 
 @functools.lru_cache(maxsize=1)
-def _textures(shown: Any) -> tuple[Any, Any]:
-    """The textures of a preview's picture and of its colours; made when they are first drawn."""
-    return _texture(shown.picture), _texture(shown.colors)
+def _textures(preview: Any) -> tuple[Any, Any]:
+    """Return the textures of a preview's picture and of its colour bar; they are made when they are first drawn."""
+    return _texture(preview.picture), _texture(preview.colors)
 
 
 def _texture(picture: NDArray[np.uint8]) -> Any:
+    """Return the texture of a picture with row 0 at the top."""
     height, width = picture.shape[:2]
     pixels = np.ones((height, width, 4), np.float32)
     pixels[..., :3] = picture[::-1] / np.float32(255)
@@ -86,63 +89,64 @@ def _draw_box(session: Any) -> None:
     context = bpy.context
     unit = context.preferences.system.ui_scale
     margin, size = _MARGIN * unit, _TEXT * unit
-    right = context.region.width - margin - _BESIDE * unit - _covered(context)
-    shown, width, height = session.shown, _WIDTH * unit, 0.0
+    right = context.region.width - margin - _BESIDE * unit - _covered_width(context)
+    preview, width, height = session.preview, _WIDTH * unit, 0.0
 
     def fits(text: str) -> bool:
         return windows.text_width(text, size) <= _WIDTH * unit
 
     lines = [piece for line in session.lines for piece in wrapped(line, fits)]
-    if shown is not None:
-        rows, columns = shown.picture.shape[:2]
-        free = context.region.height - _ABOVE * unit - 2 * margin - (1.4 * len(lines) + 2) * size
-        aspect, most = columns / rows, max(free, _LEAST * unit)
-        width, height = min(width, aspect * most), min(most, width / aspect)  # as large as fits
+    if preview is not None:
+        rows, columns = preview.picture.shape[:2]
+        free_height = context.region.height - _ABOVE * unit - 2 * margin - (1.4 * len(lines) + 2) * size
+        aspect, max_height = columns / rows, max(free_height, _MIN_HEIGHT * unit)
+        width, height = min(width, aspect * max_height), min(max_height, width / aspect)  # as large as fits
     wide, high = max(width, _WIDTH * unit), height + (1.4 * len(lines) + 2) * size
-    room = max(0.0, right - wide - margin), max(0.0, context.region.height - 2 * margin - high)
+    range_ = max(0.0, right - wide - margin), max(0.0, context.region.height - 2 * margin - high)
     x, y = context.scene.mphdrr_display.preview_place
-    left, bottom = margin + x * room[0], margin + y * room[1]
+    left_edge, bottom = margin + x * range_[0], margin + y * range_[1]
     top = bottom + high
-    box = left - size, bottom - size, left + wide + size, top
-    _boxes[context.region.as_pointer()] = box, room
+    box = left_edge - size, bottom - size, left_edge + wide + size, top
+    _boxes[context.region.as_pointer()] = box, range_
     windows.draw_rectangle(box, _BACK)
-    if shown is not None:
-        picture, colors = _textures(shown)
-        _picture(picture, _box(left, bottom + size, left + width, bottom + size + height))
-        _picture(colors, _box(left, bottom, left + width, bottom + 0.6 * size))
-    windows.draw_texts(((line, left, top - (1.4 * k + 1.7) * size, _FRONT) for k, line in enumerate(lines)), size)
+    if preview is not None:
+        picture, colors = _textures(preview)
+        _draw_texture(picture, _box(left_edge, bottom + size, left_edge + width, bottom + size + height))
+        _draw_texture(colors, _box(left_edge, bottom, left_edge + width, bottom + 0.6 * size))
+    windows.draw_texts(((line, left_edge, top - (1.4 * k + 1.7) * size, _FRONT) for k, line in enumerate(lines)), size)
 
 
 def _draw_plane(session: Any) -> None:
     """Draw the picture where the module's plane stands; it faces the ROI, as the planes do."""
-    shown = session.shown
-    if shown is None or shown.corners is None:
+    preview = session.preview
+    if preview is None or preview.corners is None:
         return
-    corners, view = shown.corners, bpy.context.region_data
-    inward = shown.run.views.detector_centers[0] - shown.run.views.sources[0]
-    back = np.array(view.view_matrix.inverted())
-    towards = back[:3, 3] - corners.mean(axis=0) if view.is_perspective else back[:3, 2]
-    if np.dot(towards, inward) <= 0:
+    corners, view = preview.corners, bpy.context.region_data
+    inward = preview.run.views.detector_centers[0] - preview.run.views.sources[0]
+    camera_matrix = np.array(view.view_matrix.inverted())
+    to_viewer = camera_matrix[:3, 3] - corners.mean(axis=0) if view.is_perspective else camera_matrix[:3, 2]
+    if np.dot(to_viewer, inward) <= 0:
         return
     gpu.state.depth_test_set("LESS_EQUAL")
-    _picture(_textures(shown)[0], (corners + 1e-3 * inward).tolist())  # before the plane of the last run
+    _draw_texture(_textures(preview)[0], (corners + 1e-3 * inward).tolist())  # before the plane of the last run
     gpu.state.depth_test_set("NONE")
 
 
 def _box(left: float, bottom: float, right: float, top: float) -> list[tuple[float, float, float]]:
+    """Return the corners of a rectangle, clockwise from top left."""
     return [(left, top, 0.0), (right, top, 0.0), (right, bottom, 0.0), (left, bottom, 0.0)]
 
 
-def _picture(texture: Any, places: list[Any]) -> None:
-    """Draw a texture to four places: from its top left, clockwise."""
+def _draw_texture(texture: Any, positions: list[Any]) -> None:
+    """Draw a texture between four positions, clockwise from its top left corner."""
     shader = gpu.shader.from_builtin("IMAGE")
     shader.uniform_sampler("image", texture)
     corners = [(0, 1), (1, 1), (1, 0), (0, 0)]
-    batch_for_shader(shader, "TRIS", {"pos": places, "texCoord": corners}, indices=_TRIANGLES).draw(shader)
+    batch_for_shader(shader, "TRIS", {"pos": positions, "texCoord": corners}, indices=_TRIANGLES).draw(shader)
 
 
-def _covered(context: bpy.types.Context) -> float:
-    """How much of the region's right the sidebar covers, in pixels."""
+def _covered_width(context: bpy.types.Context) -> float:
+    """Return the width, pixels, of the region's right part that the sidebar covers."""
     if not context.preferences.system.use_region_overlap:
         return 0.0
     return float(

@@ -1,4 +1,4 @@
-"""The Projections panel's settings: Blender properties made from `core.runs.settings`, and the recipe that they say."""
+"""Settings of the Projections panel: Blender properties made from `core.runs.settings`, and the recipe in them."""
 
 from __future__ import annotations
 
@@ -15,77 +15,77 @@ from ...core.runs.recipe import Recipe, fitting_recipe
 from ...core.runs.settings import SETTINGS
 from ..blender import setting_properties
 from ..blender.file_properties import path_property
-from ..blender.setting_properties import drawn_of, identifier, material_of, of_modules, properties_of, set_property
+from ..blender.setting_properties import material_property, modules_property, set_property
 from ..blender.updates import on_edit
 from ..scanner import scanner
 from ..volumes import volumes
 
 OPENING_ANGLE = "model.opening_angle_degrees"
-"""A setting of the scanner's here: its collimators are drawn with it."""
+"""Key of the opening angle, which the scanner's properties hold: its collimators are drawn with it."""
 
 USUAL_TIME = 600.0
-"""s, of a cardiac acquisition: what the panel has when a preset or a volume makes it count photons."""
+"""Duration, s, of a cardiac acquisition: the panel's time when a preset or a volume makes it simulate counts."""
 
 _NAMES = {"model.kind": "model", "detector.plane": "detector", "detector.rows": "height", "detector.columns": "width",
           "frames.times": "frame_times", "frames.starts": "frame_starts"}  # fmt: skip
-"""Names that .blend files keep, where they are not those of the settings."""
+"""Names of properties in .blend files that differ from the names of their settings."""
 
 PROPERTIES = {
     _NAMES.get(key, key.partition(".")[2]): setting
     for key, setting in SETTINGS.items()
     if key.startswith(("model.", "detector.", "frames.", "compute.")) and key not in (OPENING_ANGLE, "frames.bins")
 }
-"""The settings by the names of their properties. A coefficient has a second property, of its material."""
+"""The panel's settings by property name; an attenuation coefficient has a second property for its material."""
 
 
 class ProjectionSettings:
-    """How to project; mixed into the scene's properties (the panel) and into the operator (scripts)."""
+    """Properties for projecting, shared by the scene's settings (the panel) and the operator (scripts)."""
 
-    noise: BoolProperty(name="Poisson Noise", description="Draw counts instead of their expected means")
-    seed: IntProperty(name="Seed", description="Of the noise: the same seed draws the same counts", default=1, min=0)
-    first: IntProperty(name="First Module", description="Its number; 0: from the first", default=0, min=0)
-    last: IntProperty(name="Last Module", description="Its number; 0: to the last", default=0, min=0)
+    noise: BoolProperty(name="Poisson Noise", description="Draw Poisson counts instead of expected counts")
+    seed: IntProperty(name="Seed", description="Seed of the noise: it determines the drawn counts", default=1, min=0)
+    first: IntProperty(name="First Module", description="Number of the first module; 0: the lowest", default=0, min=0)
+    last: IntProperty(name="Last Module", description="Number of the last module; 0: the highest", default=0, min=0)
 
 
-ProjectionSettings.__annotations__.update(properties_of(PROPERTIES))
+ProjectionSettings.__annotations__.update(setting_properties.make_properties(PROPERTIES))
 
 
 def recipe_values(get: Callable[[str], Any]) -> dict[str, Any]:
-    """The values of the settings by their keys in a recipe, None for none; `get` gives a property's."""
-    values = setting_properties.values_of(PROPERTIES, get)
+    """Return the values of the settings by recipe key, None where unset; `get` returns a property's value by its name."""
+    values = setting_properties.read_values(PROPERTIES, get)
     values["noise.seed"] = get("seed") if get("noise") else None
     return values
 
 
 def settings_recipe(
     get: Callable[[str], Any],
-    is_given: Callable[[str], bool],
-    more: Mapping[str, Any],
+    is_set: Callable[[str], bool],
+    extra: Mapping[str, Any],
     collection: bpy.types.Collection | None = None,
 ) -> Recipe:
-    """The recipe of model, detector, noise and backend, with `more` values by their keys.
+    """Return the recipe of model, detector, noise and backend, with `extra` entries.
 
-    `get` gives a property's value, `is_given` whether a script has set it: InputError then says if it has no effect.
-    Images of the scanner `collection` that have pixels of their own have these, unless a script has set others.
+    `get` returns a property's value, `is_set` whether a script has set it: `InputError` then if it has no effect. Images of
+    a scanner `collection` with fixed pixels have these, unless a script has set others.
     """
     first, last = get("first"), get("last")
     modules = f"{first or ''}-{last or ''}" if first or last else None
-    values = {**recipe_values(get), **more, "system.modules": modules}
-    if own := collection and scanner.own_pixels(collection):
-        pixels = {"height": own[0], "width": own[1]}
-        of_images = [name for name, setting in PROPERTIES.items() if setting.key.startswith("detector.")]
-        values |= {PROPERTIES[name].key: pixels.get(name) for name in of_images if not is_given(name)}
-    given = [
+    values = {**recipe_values(get), **extra, "system.modules": modules}
+    if fixed_pixels := collection and scanner.fixed_pixels(collection):
+        pixels = {"height": fixed_pixels[0], "width": fixed_pixels[1]}
+        names = [name for name, setting in PROPERTIES.items() if setting.key.startswith("detector.")]
+        values |= {PROPERTIES[name].key: pixels.get(name) for name in names if not is_set(name)}
+    set_keys = [
         setting.key
         for name, setting in PROPERTIES.items()
-        if any(map(is_given, filter(None, (name, material_of(name, setting), of_modules(name, setting)))))
+        if any(map(is_set, filter(None, (name, material_property(name, setting), modules_property(name, setting)))))
         and values[setting.key] != setting.default
     ]
-    return fitting_recipe(values, given)
+    return fitting_recipe(values, set_keys)
 
 
 def set_panel(settings: ProjectionProperties, recipe: Recipe) -> None:
-    """Set the panel as a recipe says, and the rest to its defaults; raises InputError for what the panel cannot show."""
+    """Set the panel to a recipe's values, all else to its defaults; raise `InputError` for what the panel cannot show."""
     if recipe["model.pixel_points"] == "auto" and recipe["model.kind"] != "emission":
         raise InputError("model.pixel_points: the panel has no automatic number for radiographs")
     if recipe["frames.bins"] is not None:
@@ -96,8 +96,8 @@ def set_panel(settings: ProjectionProperties, recipe: Recipe) -> None:
         modules = int(first or 0), int(last or 0) if dash else int(first)
     for name, setting in PROPERTIES.items():
         set_property(settings, PROPERTIES, name, recipe.given.get(setting.key))
-    settings.fitted = ""  # the model is the recipe's, whatever the volume holds
-    settings.model = identifier("model", recipe["model.kind"])
+    settings.fitted = ""  # keeps the recipe's model, whatever the volume's quantity
+    settings.model = setting_properties.identifier("model", recipe["model.kind"])
     settings.noise = recipe["noise.seed"] is not None
     if settings.noise:
         settings.seed = recipe["noise.seed"]
@@ -105,7 +105,7 @@ def set_panel(settings: ProjectionProperties, recipe: Recipe) -> None:
 
 
 def use_preset(settings: ProjectionProperties, preset: str) -> None:
-    """Set the physics as a preset of `core.runs.presets` says; what it leaves alone stays."""
+    """Set the physics to a preset of `core.runs.presets`; settings that it does not name stay."""
     changes = PRESETS[preset].changes
     for name, setting in PROPERTIES.items():
         if setting.key in changes:
@@ -114,7 +114,7 @@ def use_preset(settings: ProjectionProperties, preset: str) -> None:
 
 
 def fit_model(settings: ProjectionProperties, quantity: str) -> None:
-    """Choose the model by what a volume holds, unless the user has chosen one: counts of activity, a radiograph of mu."""
+    """Choose the model by a volume's quantity unless the user has chosen one: counts for activity, a radiograph for mu."""
     model = {"activity": "EMISSION", "mu": "TRANSMISSION"}.get(quantity)
     if model is None or (settings.is_property_set("model") and settings.model != settings.fitted):
         return
@@ -124,66 +124,71 @@ def fit_model(settings: ProjectionProperties, quantity: str) -> None:
 
 
 def set_time(settings: ProjectionProperties) -> None:
-    """Nobody acquires for the default time, 1 s, which only makes counts the sensitivity's rates."""
+    """Set the usual time unless one was set: the default, 1 s, only serves to make counts equal to rates."""
     if not settings.is_property_set("time"):
         settings.time = USUAL_TIME
 
 
-def drawn(settings: ProjectionProperties, table: str) -> Iterator[tuple[str, bool]]:
-    """The properties of a table that the chosen model and hole have, each with whether it has an effect."""
-    of_others = drawn_of(
+def panel_properties(settings: ProjectionProperties, table: str) -> Iterator[tuple[str, bool]]:
+    """Yield the properties of a table that the chosen model and hole have, each with whether it has an effect."""
+    properties = setting_properties.properties_to_draw(
         PROPERTIES, settings, lambda need: need.startswith("model.kind=") or "model.hole=rays" in need, table
     )
-    for name, is_active in of_others:
+    for name, is_active in properties:
         yield name, is_active and (name != "magnification" or settings.detector == "VIRTUAL")
 
 
 def makes_counts(settings: ProjectionProperties) -> bool:
-    """Whether images hold numbers of photons, which may have noise."""
-    of_xrays = settings.model == "SPECTRAL" and settings.panel == "COUNTING"
-    return settings.model == "EMISSION" or of_xrays or (settings.model == "TRANSMISSION" and settings.photons > 0)
+    """Return whether images hold numbers of photons, which may have noise."""
+    counts_xrays = settings.model == "SPECTRAL" and settings.panel == "COUNTING"
+    return settings.model == "EMISSION" or counts_xrays or (settings.model == "TRANSMISSION" and settings.photons > 0)
 
 
 def _is_ours(self: ProjectionProperties, item: bpy.types.Object) -> bool:
+    """Return whether an object can be chosen as the volume to project: one of ours, but no map."""
     return volumes.is_volume(item) and volumes.quantity_of(item) not in MAPS
 
 
 def _attenuates(self: ProjectionProperties, item: bpy.types.Object) -> bool:
+    """Return whether an object can be chosen as the attenuation: a volume of mu or CT numbers."""
     return volumes.is_volume(item) and volumes.quantity_of(item) in ("mu", "hu")
 
 
 class RunProperties(bpy.types.PropertyGroup):
-    """A run in the scene's list, `ProjectionProperties.runs`; `addon/runs/runs.py` writes it."""
+    """Properties of a run in the scene's list `ProjectionProperties.runs`, written by `addon/runs/runs.py`."""
 
-    name: StringProperty(name="Name", description="Of the run; one that is given another name is kept")
-    usual_name: StringProperty(name="Usual Name", description="That it got when it was made", options={"HIDDEN"})
-    file: path_property("File", "With its exact arrays", "HIDDEN")
-    scanner: PointerProperty(name="Scanner", description="That it is of", type=bpy.types.Collection)
-    summary: StringProperty(name="Summary", description="What it is", options={"HIDDEN"})
-    state: StringProperty(name="State", description="Of the scene when it was made, float64 JSON", options={"HIDDEN"})
+    name: StringProperty(name="Name", description="Name of the run; a renamed run is kept")
+    usual_name: StringProperty(name="Usual Name", description="Original name of the run", options={"HIDDEN"})
+    file: path_property("File", "File with the run's exact arrays", "HIDDEN")
+    scanner: PointerProperty(name="Scanner", description="Scanner of the run", type=bpy.types.Collection)
+    summary: StringProperty(name="Summary", description="Contents of the run", options={"HIDDEN"})
+    state: StringProperty(name="State", description="The scene's state when made, float64 JSON", options={"HIDDEN"})
     keep: BoolProperty(
         name="Keep",
-        description="Keep this run. Of the others the last two stay, and the next render replaces the older",
+        description="Keep this run. Of all others the last two stay, and the next render replaces the older",
     )
-    is_saved: BoolProperty(name="Saved", description="A saved .blend may need its file", options={"HIDDEN"})
+    is_saved: BoolProperty(name="Saved", description="A saved .blend may need the run's file", options={"HIDDEN"})
 
     @property
     def is_kept(self) -> bool:
-        """Whether the next render leaves it."""
+        """Whether the next render keeps the run."""
         return bool(self.keep or self.name != self.usual_name)
 
 
 def _volume_chosen(self: ProjectionProperties, context: bpy.types.Context) -> None:
-    # In the panel: to a script, a model that changes by itself would be a wrong number without a word.
+    # Only in the panel: for a script, a model that changes by itself would give wrong numbers without a warning.
+    """Fit the model to a volume that the user chooses in the panel."""
     if self.volume is not None and context.region is not None and context.region.type == "UI":
         fit_model(self, volumes.quantity_of(self.volume))
 
 
 def _projects_all(self: ProjectionProperties) -> bool:
+    """Return whether all modules are projected."""
     return self.first == self.last == 0
 
 
 def _project_all(self: ProjectionProperties, value: bool) -> None:
+    """Choose all modules, or the range of all numbers of the active scanner."""
     collection = None if value else scanner.active_scanner(self.id_data)
     numbers = [camera.mphdrr_module.number for camera in scanner.modules(collection)] if collection else []
     self.first, self.last = (min(numbers), max(numbers)) if numbers else (0, 0 if value else 1)
@@ -193,7 +198,7 @@ class ProjectionProperties(ProjectionSettings, bpy.types.PropertyGroup):
     """State of the Projections panel; `Scene.mphdrr_projections`."""
 
     volume: PointerProperty(
-        name="Volume", description="What to project; empty: the active volume, or the only one", type=bpy.types.Object,
+        name="Volume", description="Volume to project; empty: the active volume, or the only one", type=bpy.types.Object,
         poll=_is_ours, update=_volume_chosen,
     )  # fmt: skip
     all_modules: BoolProperty(
@@ -201,7 +206,7 @@ class ProjectionProperties(ProjectionSettings, bpy.types.PropertyGroup):
         get=_projects_all, set=_project_all,
     )  # fmt: skip
     fitted: StringProperty(
-        name="Fitted Model", description="The model that the volume's quantity has chosen", options={"HIDDEN"}
+        name="Fitted Model", description="Model chosen for the volume's quantity", options={"HIDDEN"}
     )
     mu: PointerProperty(
         name="Attenuation", description="Volume of attenuation coefficients (1/mm) before the pinhole, or of CT numbers, "
@@ -210,12 +215,12 @@ class ProjectionProperties(ProjectionSettings, bpy.types.PropertyGroup):
     )  # fmt: skip
     runs: CollectionProperty(type=RunProperties, name="Runs", options={"HIDDEN"})
     active_run: IntProperty(
-        name="Run", description="The run in the list whose images are shown", update=on_edit("active_run")
+        name="Run", description="Run in the list whose images are shown", update=on_edit("active_run")
     )
     run_file: path_property("Run", "File with the shown run's exact arrays", "HIDDEN")
-    run_summary: StringProperty(name="Shown Run", description="What the shown run is", options={"HIDDEN"})
+    run_summary: StringProperty(name="Shown Run", description="Contents of the shown run", options={"HIDDEN"})
 
 
-ProjectionProperties.__annotations__.update(setting_properties.unset_of(PROPERTIES))
+ProjectionProperties.__annotations__.update(setting_properties.make_check_marks(PROPERTIES))
 
 CLASSES = (RunProperties, ProjectionProperties)

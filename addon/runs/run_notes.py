@@ -1,4 +1,4 @@
-"""Lines over the pictures in the Image Editor: what is known of measured counts, and what has changed since."""
+"""Notes over the pictures in the Image Editor: measured counts in words, and changes of the scene since the run."""
 
 import bpy
 
@@ -8,8 +8,8 @@ from . import runs
 
 _COLOR = (1.0, 0.62, 0.2, 1.0)
 _PLAIN, _BACK = (1.0, 1.0, 1.0, 1.0), (0.08, 0.08, 0.08, 1.0)
-_SIZE, _LEFT = 13, 12  # of the letters, and from the region's corner; pixels at a resolution scale of 1
-_CORNER, _WIDTH = 0.3, 3.0  # of a tile's height: its stale corner's sides; and how thick they are, in such pixels
+_SIZE, _LEFT = 13, 12  # height of the letters, and their distance from the left; pixels at a resolution scale of 1
+_CORNER, _WIDTH = 0.3, 3.0  # length of a stale corner's sides relative to its tile, and their width, pixels as above
 
 
 def draw() -> None:
@@ -22,7 +22,7 @@ def draw() -> None:
     if not images.is_ours(image):
         return
     lines, stale = runs.change_lines(context.scene), runs.stale_modules(context.scene)
-    if not images.is_of(context.scene):
+    if not images.belong_to(context.scene):
         lines, stale = ["the projections of another scene"], None
     texts = (
         [(f"Not of the scene as it is now: {', '.join(lines)}", _COLOR)] if lines and lines != [runs.UNKNOWN] else []
@@ -32,13 +32,13 @@ def draw() -> None:
     if not texts:
         return
     scale = context.preferences.system.ui_scale
-    bar, left, placed = scale * images.BAR, scale * _LEFT, []
+    bar, x, positioned = scale * images.BAR, scale * _LEFT, []
     windows.draw_rectangle((0.0, 0.0, context.region.width, bar), _BACK)
     for text, color in texts:
-        placed.append((text, left, 0.3 * bar, color))
-        left += windows.text_width(text, scale * _SIZE) + 2 * scale * _LEFT
-    windows.draw_texts(placed, scale * _SIZE)
-    for picture in tiles.pictures(image):
+        positioned.append((text, x, 0.3 * bar, color))
+        x += windows.text_width(text, scale * _SIZE) + 2 * scale * _LEFT
+    windows.draw_texts(positioned, scale * _SIZE)
+    for picture in tiles.shown_pictures(image):
         if stale is None or picture.number in stale:
             _draw_corner(tiles.frame(context, picture, image.size), scale)
 
@@ -46,6 +46,6 @@ def draw() -> None:
 def _draw_corner(frame: tuple[float, float, float, float], scale: float) -> None:
     """Draw the upper right corner of a frame from outside, so that nothing of the picture is covered."""
     _, bottom, right, top = frame
-    side, out = _CORNER * (top - bottom), scale * _WIDTH / 2
-    corner = [(right + out - side, top + out, 0), (right + out, top + out, 0), (right + out, top + out - side, 0)]
-    windows.draw_lines(corner, _COLOR, scale * _WIDTH, "LINE_STRIP")
+    side, half_width = _CORNER * (top - bottom), scale * _WIDTH / 2
+    x, y = right + half_width, top + half_width
+    windows.draw_lines([(x - side, y, 0), (x, y, 0), (x, y - side, 0)], _COLOR, scale * _WIDTH, "LINE_STRIP")

@@ -1,4 +1,4 @@
-"""Camera datablocks that see what a module's view shows.
+"""Camera datablocks that see exactly the view of their module.
 
 A Blender camera is right-handed with X right, Y up and looks along -Z; seen from the pinhole, +v is up and +u is
 to the LEFT. So a module's camera has X = -u, Y = v, Z = -k.
@@ -12,90 +12,95 @@ import bpy
 import numpy as np
 from numpy.typing import NDArray
 
-_KEY = "mphdrr_solid"  # custom property of a camera: the field that it was set to, as `_text`
+_KEY = "mphdrr_solid"  # custom property of a camera: the field that it was set to, as a text
 _CAMERA_FROM_MODULE = np.diag([-1.0, 1.0, -1.0, 1.0])
-_ROUNDING = 1e-5  # of a field of view
-_SMALLEST = 1.0  # Blender silently clamps Camera.lens and Camera.sensor_width below this
+_ROUNDING = 1e-5  # rounding of a field of view, relative to its width
+_MIN_SIZE = 1.0  # Blender silently clamps Camera.lens and Camera.sensor_width below this
 
 Field = tuple[float, ...]
-"""x, y and distance of the middle of what a camera sees, its width and height, in any unit: only their ratios count."""
+"""x, y and distance of the centre of a camera's field, then width and height, in any unit: only their ratios matter."""
 
 
-def matrices_of(poses: NDArray[np.float64]) -> NDArray[np.float64]:
-    """World matrices (M, 4, 4) of the cameras of modules at `poses` (M, 4, 4)."""
+def camera_matrices(poses: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the world matrices (M, 4, 4) of the cameras of modules at `poses` (M, 4, 4)."""
     return poses @ _CAMERA_FROM_MODULE
 
 
-def poses_of(matrices: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The modules' poses (M, 4, 4) whose cameras have these world matrices (M, 4, 4), but for their scale."""
+def module_poses(matrices: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the poses (M, 4, 4) of modules from their cameras' world matrices (M, 4, 4), whose scale is removed."""
     poses = matrices @ _CAMERA_FROM_MODULE
     poses[:, :3, :3] /= np.linalg.norm(poses[:, :3, :3], axis=1, keepdims=True)
     return poses
 
 
 def set_field_of_view(camera: bpy.types.Camera, field: Field) -> None:
-    """Make a camera see just that field."""
+    """Make a camera see exactly a field."""
     x, y, distance, width, height = field
     width, height = abs(width), abs(height)  # an image may be upside down
-    scale = max(1.0, *(_SMALLEST / size for size in (width, height, distance)))
+    scale = max(1.0, *(_MIN_SIZE / size for size in (width, height, distance)))
     camera.type = "PERSP"
     camera.sensor_fit = "HORIZONTAL"
     camera.sensor_width, camera.sensor_height = width * scale, height * scale
     camera.lens_unit = "MILLIMETERS"
     camera.lens = distance * scale
     camera.shift_x, camera.shift_y = x / width, y / width
-    camera[_KEY] = _text(field)
+    camera[_KEY] = _format_field(field)
 
 
 def has_field_of_view(camera: bpy.types.Camera) -> bool:
-    """Whether a camera's picture is as `set_field_of_view` made it."""
+    """Return whether the user has left a camera's lens and sensor as `set_field_of_view` set them."""
     if _KEY not in camera:
         return True
     x, y, distance, width, _ = field_of(camera)
-    now = camera.sensor_width / camera.lens * distance / abs(width) - 1.0, camera.shift_x, camera.shift_y
+    errors = camera.sensor_width / camera.lens * distance / abs(width) - 1.0, camera.shift_x, camera.shift_y
     return (
         camera.type == "PERSP"
         and camera.sensor_fit == "HORIZONTAL"
-        and all(abs(a - b) < _ROUNDING for a, b in zip(now, (0.0, x / abs(width), y / abs(width)), strict=True))
+        and all(abs(a - b) < _ROUNDING for a, b in zip(errors, (0.0, x / abs(width), y / abs(width)), strict=True))
     )
 
 
 def is_set_to(camera: bpy.types.Camera, field: Field) -> bool:
-    """Whether a camera was last set to that field."""
-    return bool(camera.get(_KEY) == _text(field))
+    """Return whether a camera was last set to a field."""
+    return bool(camera.get(_KEY) == _format_field(field))
 
 
 def field_of(camera: bpy.types.Camera) -> Field:
-    """The field that a camera was last set to."""
-    return _field(camera[_KEY])
+    """Return the field that a camera was last set to."""
+    return _parse_field(camera[_KEY])
 
 
-def _text(field: Field) -> str:
-    """A field as cameras keep it: distance and side of a square one in the middle, as all were once; else all of it."""
+def _format_field(field: Field) -> str:
+    """Return a field as the text that cameras keep.
+
+    A square field around the axis is (distance, side), as in the first versions.
+    """
     x, y, distance, width, height = field
     return repr((distance, width) if x == y == 0 and width == height else tuple(field))
 
 
 @lru_cache(maxsize=4096)
-def _field(text: str) -> Field:
+def _parse_field(text: str) -> Field:
+    """Return the field of a text from `_format_field`."""
     numbers: Any = literal_eval(text)
     return numbers if len(numbers) > 2 else (0.0, 0.0, *numbers, numbers[1])
 
 
-def take_backgrounds(new: Any, old: Any) -> None:
-    """Show behind a camera the pictures that stood behind another one, where and as they did."""
+def copy_backgrounds(new: Any, old: Any) -> None:
+    """Copy the background pictures of a camera, with their settings, to another camera."""
     new.show_background_images = old.show_background_images
     for picture in old.background_images:
-        _take_settings(new.background_images.new(), picture)
+        _copy_settings(new.background_images.new(), picture)
 
 
-def _take_settings(new: Any, old: Any) -> None:
+def _copy_settings(new: Any, old: Any) -> None:
+    """Copy the settings of a background picture."""
     for setting in old.bl_rna.properties:
         name = setting.identifier
         if not setting.is_readonly:
             setattr(new, name, getattr(old, name))
-        elif name in ("image_user", "clip_user"):  # which frames are shown when
-            _take_settings(getattr(new, name), getattr(old, name))
+        elif name in ("image_user", "clip_user"):  # the frames to show
+            _copy_settings(getattr(new, name), getattr(old, name))
 
 
 def set_up_camera(camera: bpy.types.Camera, field: Field, distance: float) -> None:

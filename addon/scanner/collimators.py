@@ -1,4 +1,4 @@
-"""How modules look: the meshes of their parts and of the ROI sphere, and their colours."""
+"""Appearance of modules: meshes of their parts and of the ROI sphere, and their colours."""
 
 import bmesh
 import bpy
@@ -8,16 +8,16 @@ from ...core.geometry import part_colors
 from ...core.geometry.module_parts import Solid, check_watertight
 from ..blender import compat
 
-# By `Object.mphdrr_module.part`: the material's name, and its colour and gloss. Exported solids look the same.
+# The material's name, and its colour and gloss, by `Object.mphdrr_module.part`. Exported solids look the same.
 LOOKS = {kind.upper(): (f"mphDRR {kind}", look) for kind, look in part_colors.LOOKS.items()}
 PARTS = tuple(LOOKS)
-"""What hangs on a module's camera."""
+"""The kinds of parts that are children of a module's camera."""
 LOOKS["ROI"] = "mphDRR ROI", part_colors.Look((0.25, 0.62, 1.0, 0.12), metallic=0.0, roughness=0.5)  # pale blue
 LOOKS["ARROWS"] = "mphDRR arrows", part_colors.Look((1.0, 0.3, 0.0, 1.0), metallic=0.0, roughness=0.6)  # orange
 
 
 def new_mesh(name: str, solid: Solid, material: bpy.types.Material) -> bpy.types.Mesh:
-    """A mesh datablock of a solid, checked to be watertight, with one material."""
+    """Return a new mesh datablock of a solid, checked to be watertight, with one material."""
     check_watertight(solid)
     mesh = bpy.data.meshes.new(name)
     reshape_mesh(mesh, solid)
@@ -26,7 +26,7 @@ def new_mesh(name: str, solid: Solid, material: bpy.types.Material) -> bpy.types
 
 
 def has_shape(mesh: bpy.types.Mesh, solid: Solid) -> bool:
-    """Whether the points of a mesh are those of `solid`."""
+    """Return whether the points of a mesh are those of `solid`."""
     points = np.empty(3 * len(mesh.vertices), np.float32)
     mesh.attributes["position"].data.foreach_get("vector", points)
     return np.array_equal(points, solid[0].astype(np.float32).ravel())
@@ -36,22 +36,22 @@ def reshape_mesh(mesh: bpy.types.Mesh, solid: Solid) -> None:
     """Give a mesh the shape of `solid`, in place: undo needs the same datablock."""
     vertices, faces = solid
     if len(mesh.vertices) == len(vertices) and len(mesh.polygons) == len(faces):
-        # 30 times as fast as by `vertices`:
+        # Setting the attribute is 30 times as fast as setting `vertices`.
         mesh.attributes["position"].data.foreach_set("vector", vertices.astype(np.float32).ravel())
         mesh.update()
-    else:  # it is new, or the user has edited it
+    else:  # the mesh is new, or the user has edited it
         mesh.clear_geometry()
         mesh.from_pydata(vertices, [], faces)
         mesh.shade_flat()
 
 
 def new_sphere(name: str, radius: float, material: bpy.types.Material) -> bpy.types.Mesh:
-    """A smooth sphere of `radius` mm around the origin."""
+    """Return a new smooth sphere of `radius` mm around the origin."""
     mesh = bpy.data.meshes.new(name)
-    shape = bmesh.new()
-    bmesh.ops.create_uvsphere(shape, u_segments=64, v_segments=32, radius=radius)
-    shape.to_mesh(mesh)
-    shape.free()
+    edit_mesh = bmesh.new()
+    bmesh.ops.create_uvsphere(edit_mesh, u_segments=64, v_segments=32, radius=radius)
+    edit_mesh.to_mesh(mesh)
+    edit_mesh.free()
     mesh.shade_smooth()
     mesh.materials.append(material)
     return mesh
@@ -60,7 +60,7 @@ def new_sphere(name: str, radius: float, material: bpy.types.Material) -> bpy.ty
 def resize_sphere(mesh: bpy.types.Mesh, radius: float) -> None:
     """Give a sphere around the origin another radius, mm, in place."""
     if len(mesh.vertices) and abs(mesh.vertices[0].co.length - radius) <= 1e-6 * radius:
-        return  # as nearly always
+        return  # in nearly all calls
     points = np.empty(3 * len(mesh.vertices), np.float32)
     mesh.vertices.foreach_get("co", points)
     norms = np.linalg.norm(points.reshape(-1, 3), axis=1)
@@ -70,13 +70,13 @@ def resize_sphere(mesh: bpy.types.Mesh, radius: float) -> None:
 
 
 def part_material(part: str) -> bpy.types.Material:
-    """The material of a scanner's parts of one kind; an existing one keeps what the user has changed."""
+    """Return the material of a scanner's parts of one kind; an existing one keeps the user's changes."""
     name, look = LOOKS[part]
     material = bpy.data.materials.get(name)
     if material is not None:
         return material
     material, shader = compat.surface_material(name, "ShaderNodeBsdfPrincipled")
-    # In Solid view:
+    # These show in Solid view; the shader's inputs show in renders.
     material.diffuse_color, material.metallic, material.roughness = look.color, 0.3 * look.metallic, look.roughness
     if look.color[3] < 1.0:
         material.surface_render_method = "BLENDED"
@@ -84,7 +84,7 @@ def part_material(part: str) -> bpy.types.Material:
     shader.inputs["Metallic"].default_value = look.metallic
     shader.inputs["Roughness"].default_value = look.roughness
     shader.inputs["Alpha"].default_value = look.color[3]
-    if part == "ROI":  # transparent but for its rim
+    if part == "ROI":  # only the rim of the sphere is visible
         tree = material.node_tree
         weight = compat.add_node(tree, "ShaderNodeLayerWeight", (-520, 0), {"Blend": 0.25})
         scaled = compat.add_math(tree, "MULTIPLY", (-260, 0), weight.outputs["Facing"], 0.35)

@@ -1,9 +1,9 @@
-"""A part of a module that is moved takes its module along: a collimator, a crystal or a plane with a projection.
+"""Parts that take their module along when they are moved: a collimator, a crystal or a plane with a projection.
 
-While a tool drags a part, the tool writes the part's own place again and again, as seen from where its camera stood at
-first: the part remembers that (`_START`), the camera goes where the part leads it, and the part's parent inverse keeps it
-at its place on the camera. Nothing is lost if Blender stores an undo step before a handler has seen the last motion:
-the part's place and where the camera started say where the module is.
+While a tool drags a part, it writes the part's own matrix again and again, relative to where the part's camera was at the
+start: the part stores that camera matrix (`_START`), the camera goes where the part leads it, and the part's parent inverse
+keeps the part at its position on the camera. Nothing is lost if Blender stores an undo step before a handler has seen the
+last motion: the part's own matrix and the camera's start matrix determine the module's position.
 """
 
 from collections.abc import Iterable
@@ -17,59 +17,59 @@ from numpy.typing import NDArray
 from ..blender import objects
 from . import collimators, following
 
-_HOME = "mphdrr_home"  # custom property of a plane: its place on its camera (4, 4)
-_START = "mphdrr_start"  # custom property of a part that is dragged: world matrix (4, 4) of its camera when that began
-_NEAR = 1e-5  # mm, or of a rotation's matrix: rounding
+_HOME = "mphdrr_home"  # custom property of a plane: its matrix (4, 4) relative to its camera
+_START = "mphdrr_start"  # custom property of a dragged part: its camera's world matrix (4, 4) at the start of the drag
+_TOLERANCE = 1e-5  # rounding of a matrix: mm of its translation, and of its rotation's elements
 _AT_HOME = Matrix()
 
 
-def place(item: bpy.types.Object, matrix: Matrix) -> None:
-    """Give a plane its place on its module's camera."""
+def set_home(item: bpy.types.Object, matrix: Matrix) -> None:
+    """Place a plane on its module's camera, at a matrix relative to the camera."""
     item.matrix_basis = matrix
     item[_HOME] = [x for row in matrix for x in row]
 
 
 def is_part(item: bpy.types.Object) -> bool:
-    """Whether a module is moved by it."""
+    """Return whether moving an object moves a module."""
     return item.mphdrr_module.part in collimators.PARTS or _HOME in item
 
 
 def is_dragging() -> bool:
-    """Whether one of Blender's tools is moving something."""
+    """Return whether one of Blender's tools is moving something."""
     windows = bpy.context.window_manager.windows
     return any(o.bl_idname.startswith(("TRANSFORM_OT", "OBJECT_OT")) for w in windows for o in w.modal_operators)
 
 
 def is_dragged(item: bpy.types.Object) -> bool:
-    """Whether a part is dragged, or was and is not back."""
+    """Return whether a part is being dragged, or has been and is not back at its home."""
     return _START in item
 
 
-def is_off(item: bpy.types.Object) -> bool:
-    """Whether a part is not at its place on its module's camera, and may take the module along."""
+def is_displaced(item: bpy.types.Object) -> bool:
+    """Return whether a part is away from its home on its module's camera, and may take the module along."""
     camera = item.parent
     if camera is None or not camera.mphdrr_module.is_module or item.library or camera.library:
         return False
-    place = item.matrix_parent_inverse @ item.matrix_basis
+    matrix = item.matrix_parent_inverse @ item.matrix_basis
     home = _home(item)
-    if place == home:  # as nearly all are: numpy takes ten times as long
+    if matrix == home:  # true of nearly all parts, and ten times as fast as numpy
         return False
-    if np.abs(np.array(place) - np.array(home)).max() <= _NEAR:
+    if np.abs(np.array(matrix) - np.array(home)).max() <= _TOLERANCE:
         return False
-    kind = item.mphdrr_module.part
-    is_copy = sum(o.mphdrr_module.part == kind for o in camera.children) > 1  # which of them would it be?
-    return following.is_free(item) and item.parent_type == "OBJECT" and not is_copy
+    part = item.mphdrr_module.part
+    has_copy = sum(o.mphdrr_module.part == part for o in camera.children) > 1  # then it is unclear which one leads
+    return following.is_free(item) and item.parent_type == "OBJECT" and not has_copy
 
 
-def carry(items: Iterable[bpy.types.Object], dragging: bool) -> set[bpy.types.Object]:
-    """Bring parts that are off back to their places on their cameras; returns the cameras that have moved for it.
+def move_modules_with(items: Iterable[bpy.types.Object], dragging: bool) -> set[bpy.types.Object]:
+    """Bring displaced parts back to their homes on their cameras, and return the cameras moved for that.
 
-    A camera goes where the first of its parts leads it, but not if it moves by itself.
+    A camera goes where the first of its parts leads it, unless the camera itself is being moved.
     """
     starts: dict[bpy.types.Object, NDArray[np.float64]] = {}
-    for item in filter(is_off, items):
+    for item in filter(is_displaced, items):
         camera, home = item.parent, _home(item)
-        if camera not in starts and (is_dragged(item) or not _moves_itself(camera, dragging)):
+        if camera not in starts and (is_dragged(item) or not _is_moved_itself(camera, dragging)):
             start = np.reshape(item[_START], (4, 4)) if is_dragged(item) else objects.world_matrix(camera)
             motion: Any = np.array(item.matrix_basis, np.float64) @ np.linalg.inv(home)
             motion[:3, :3] /= np.linalg.norm(motion[:3, :3], axis=0)
@@ -84,33 +84,34 @@ def carry(items: Iterable[bpy.types.Object], dragging: bool) -> set[bpy.types.Ob
     return set(starts)
 
 
-def finish(item: bpy.types.Object) -> None:
-    """End the drag of a part: its camera goes where the last motion led it, and the part to its place on it."""
-    carry([item], dragging=False)
+def finish_drag(item: bpy.types.Object) -> None:
+    """End the drag of a part: move its camera by the last motion, and the part back to its home on the camera."""
+    move_modules_with([item], dragging=False)
     put_back(item)
 
 
 def put_back(item: bpy.types.Object) -> None:
-    """Put a part to its place on its camera, where that stands now."""
+    """Put a part at its home on its camera, at the camera's present position."""
     item.matrix_basis, item.matrix_parent_inverse = _home(item), Matrix()
     if _START in item:
         del item[_START]
 
 
-def _moves_itself(camera: bpy.types.Object, dragging: bool) -> bool:
-    """Whether a camera has been moved, or is animated or under a constraint."""
-    place = objects.world_matrix(camera)[:3, 3].astype(np.float32)
-    was_moved = np.any(np.array(camera.mphdrr_module.placed, np.float32) != place)
+def _is_moved_itself(camera: bpy.types.Object, dragging: bool) -> bool:
+    """Return whether a camera has been moved, or is animated or constrained."""
+    position = objects.world_matrix(camera)[:3, 3].astype(np.float32)
+    was_moved = np.any(np.array(camera.mphdrr_module.placed, np.float32) != position)
     return bool(was_moved) or (dragging and camera.select_get()) or not following.is_free(camera)
 
 
 def _home(item: bpy.types.Object) -> Matrix:
+    """Return the matrix of a part's home relative to its camera."""
     values = item.get(_HOME)
     return _AT_HOME if values is None else Matrix([values[row : row + 4] for row in range(0, 16, 4)])
 
 
 def _move(camera: bpy.types.Object, matrix: NDArray[np.float64]) -> None:
-    """Put a camera at a world matrix, as far as its locks allow."""
+    """Move a camera to a world matrix, as far as its locks allow."""
     location, rotation = camera.location.copy(), camera.rotation_euler.copy()
     objects.set_world_matrix(camera, matrix)
     for axis in range(3):

@@ -1,4 +1,4 @@
-"""Modules made, removed and renumbered in the scene, by operators (undo steps), not by handlers."""
+"""Edits that add, remove and renumber modules in the scene, by operators (undo steps), not by handlers."""
 
 import json
 import re
@@ -19,63 +19,63 @@ from . import cameras, collimators, following, module_values, pinholes, scanner
 from .scanner_parts import clear, new_part, parts_and_others
 
 _WORDS = (*(kind.word for kind in SCANNERS.values()), *(part.capitalize() for part in collimators.PARTS))
-_OURS = re.compile(rf"({'|'.join(dict.fromkeys(_WORDS))}) \d+(\.\d+)?")  # a name that the extension gave
+_OUR_NAME = re.compile(rf"({'|'.join(dict.fromkeys(_WORDS))}) \d+(\.\d+)?")  # a name that no user has given
 
 
 def copied_cameras(collection: bpy.types.Collection) -> list[bpy.types.Object]:
-    """Cameras with another camera's module number: Blender copied them. "Module 07.001" is the copy of "Module 07"."""
-    seen: set[int] = set()
+    """Return cameras with the same module number as another camera: "Module 07.001", Blender's copy of "Module 07"."""
+    numbers: set[int] = set()
     copied = []
     for camera in sorted(scanner.modules(collection), key=lambda o: (len(o.name), o.name)):
         number = camera.mphdrr_module.number
-        if number in seen:
+        if number in numbers:
             copied.append(camera)
-        seen.add(number)
+        numbers.add(number)
     return copied
 
 
 def orphan_parts(collection: bpy.types.Collection) -> list[bpy.types.Object]:
-    """Parts whose camera was deleted."""
-    there = set(scanner.modules(collection))  # Blender takes long to say which collections an object is in
+    """Return parts whose camera was deleted."""
+    cameras_ = set(scanner.modules(collection))  # quicker than each camera's `users_collection`
     return [
         item
         for item in collection.all_objects
         if item.mphdrr_module.part in collimators.PARTS
-        and item.parent not in there
+        and item.parent not in cameras_
         and not (item.parent is not None and item.parent.mphdrr_module.is_module and item.parent.users_collection)
     ]
 
 
 def bare_cameras(collection: bpy.types.Collection) -> list[bpy.types.Object]:
-    """Modules without parts, of a kind that has some: copies whose original was deleted."""
+    """Return modules without parts, of a kind that has some: copies whose original was deleted."""
     parts = following.parts_of(collection, scanner.modules(collection))
-    bare = [camera for camera, own in parts.items() if not own]
+    bare = [camera for camera, module_parts in parts.items() if not module_parts]
     return bare if bare and module_values.kind_of(collection).parts is not Scanner.parts else []
 
 
 def untidy_text(collection: bpy.types.Collection) -> str:
-    """What `tidy` would put in order, in words; empty where all is in order."""
+    """Return in words what `tidy` would put in order; "" where there is nothing."""
     copied = copied_cameras(collection)
     bare = [camera for camera in bare_cameras(collection) if camera not in copied]
-    found = (
+    kinds = (
         ("copied camera{}", copied),
         ("bare camera{}", bare),
         ("part{} without a camera", orphan_parts(collection)),
     )
-    return ", ".join(f"{len(items)} {text.format('s' * (len(items) > 1))}" for text, items in found if items)
+    return ", ".join(f"{len(items)} {text.format('s' * (len(items) > 1))}" for text, items in kinds if items)
 
 
 def tidy(collection: bpy.types.Collection) -> tuple[list[int], int]:
     """Make modules of copied cameras, and remove parts without a camera.
 
-    Returns the new modules' numbers, and how many parts were removed. Where a shape cannot be built nothing is changed.
+    Return the new modules' numbers and how many parts were removed. Where a part cannot be built, nothing is changed.
     """
     copied, orphans, numbers = copied_cameras(collection), orphan_parts(collection), []
     for camera in (*copied, *bare_cameras(collection)):
-        _solids(collection, camera)  # refuses what cannot be, before anything is changed
+        _build_parts(collection, camera)  # raises `InputError` before anything is changed
     objects.remove_objects(orphans)
     for camera in copied:
-        adopt(collection, camera)
+        make_module(collection, camera)
         numbers.append(camera.mphdrr_module.number)
     for camera in bare_cameras(collection):
         _add_parts(collection, camera)
@@ -85,17 +85,17 @@ def tidy(collection: bpy.types.Collection) -> tuple[list[int], int]:
     return numbers, len(orphans)
 
 
-def adopt(collection: bpy.types.Collection, camera: bpy.types.Object, module: Scanner | None = None) -> None:
-    """Make the copy of a module's camera a module of its own: `module`, or what its place and values make of it."""
-    found = [o for o in scanner.modules(collection) if o != camera]
-    number = max(o.mphdrr_module.number for o in found) + 1
+def make_module(collection: bpy.types.Collection, camera: bpy.types.Object, module: Scanner | None = None) -> None:
+    """Make a copied camera a module of its own: `module`, or the one that the camera's position and values describe."""
+    other_cameras = [o for o in scanner.modules(collection) if o != camera]
+    number = max(o.mphdrr_module.number for o in other_cameras) + 1
     if not following.parts_of(collection, [camera])[camera]:
         _add_parts(collection, camera)
     camera.mphdrr_module.number = number
-    module_values.remember([camera], module or _read(collection, camera))
+    module_values.store_exact_values([camera], module or _read_or_imported(collection, camera))
     camera.mphdrr_module.number, camera.mphdrr_module.added = number, True
-    camera.mphdrr_module.index = max(o.mphdrr_module.index for o in found) + 1
-    camera.name = ids.module_name(number, len(found) + 1, module_values.kind_of(collection).word)
+    camera.mphdrr_module.index = max(o.mphdrr_module.index for o in other_cameras) + 1
+    camera.name = ids.module_name(number, len(other_cameras) + 1, module_values.kind_of(collection).word)
     if camera.data.users > 1:
         camera.data = camera.data.copy()
     camera.data.name = camera.name
@@ -105,106 +105,109 @@ def adopt(collection: bpy.types.Collection, camera: bpy.types.Object, module: Sc
             part.data.name = part.name
 
 
-def _read(collection: bpy.types.Collection, camera: bpy.types.Object) -> Scanner:
-    """A module as it stands now, or, while that is impossible, as it was imported."""
+def _read_or_imported(collection: bpy.types.Collection, camera: bpy.types.Object) -> Scanner:
+    """Return a module as it stands now, or as it was imported while its present values are impossible."""
     try:
         return scanner.read_module(collection, camera)
     except InputError:
-        return module_values.imported(module_values.kind_of(collection), (camera.mphdrr_module.exact,))
+        return module_values.as_imported(module_values.kind_of(collection), (camera.mphdrr_module.exact,))
 
 
-def _solids(collection: bpy.types.Collection, camera: bpy.types.Object) -> Sequence[ModulePart]:
-    """A module's parts; raises InputError where they cannot be built."""
+def _build_parts(collection: bpy.types.Collection, camera: bpy.types.Object) -> Sequence[ModulePart]:
+    """Return a module's parts; raise `InputError` where they cannot be built."""
     construction = pinholes.construction(collection.mphdrr_scanner, module_values.kind_of(collection))
-    return _read(collection, camera).parts(construction)
+    return _read_or_imported(collection, camera).parts(construction)
 
 
 def _add_parts(collection: bpy.types.Collection, camera: bpy.types.Object) -> None:
-    for built in _solids(collection, camera):
-        item = new_part(camera, ids.part_name(camera.name, built.kind), built)
+    """Add a module's parts to the scene, as children of its camera."""
+    for part in _build_parts(collection, camera):
+        item = new_part(camera, ids.part_name(camera.name, part.kind), part)
         item.hide_viewport, item.hide_render = camera.hide_viewport, camera.hide_render
-        for home in camera.users_collection:
-            home.objects.link(item)
+        for owner in camera.users_collection:
+            owner.objects.link(item)
 
 
-def duplicate(
+def duplicate_modules(
     collection: bpy.types.Collection, modules: Sequence[bpy.types.Object], count: int, angle: float, follow_ring: bool
 ) -> list[bpy.types.Object]:
-    """Make `count` copies of each module, `angle` radians apart about the world's z axis; returns their camera objects.
+    """Make `count` copies of each module, `angle` radians apart about the world's z axis, and return their camera objects.
 
     With `follow_ring` a copy's z and distance from the z axis are those of the ring at its azimuth, linear between
     neighbours and constant beyond the arc's ends; it keeps its tilt. Raises InputError, and leaves the scene as it was,
-    where a module already stands in a copy's place or its shapes cannot be built.
+    where a module already stands in a copy's place or its parts cannot be built.
     """
-    taken = [_place(o) for o in scanner.modules(collection)]
+    positions = [_position(o) for o in scanner.modules(collection)]
     angles = np.linspace(angle, count * angle, count)
     copies: list[tuple[bpy.types.Object, Scanner]] = []
     for camera in modules:
-        _solids(collection, camera)
+        _build_parts(collection, camera)
         module = scanner.read_module(collection, camera)
-        poses = _along_ring(collection, camera, module, angles, follow_ring)
+        poses = _copied_poses(collection, camera, module, angles, follow_ring)
         for pose in poses:
-            if np.linalg.norm(np.array(taken) - pose[:3, 3], axis=1).min() < 1e-3:
+            if np.linalg.norm(np.array(positions) - pose[:3, 3], axis=1).min() < 1e-3:
                 raise InputError(
                     f"a copy of module {camera.mphdrr_module.number} would stand in the place of another module: "
                     "choose another angle or count"
                 )
-            taken.append(pose[:3, 3])
-            copies.append((camera, module_values.with_design(camera, module.at_poses(pose[None]))))
-    made = []
+            positions.append(pose[:3, 3])
+            copies.append((camera, module_values.with_formula_values(camera, module.at_poses(pose[None]))))
+    copies_ = []
     for camera, module in copies:
         copy = camera.copy()
         copy.data = camera.data.copy()
         copy.animation_data_clear()
-        for home in camera.users_collection:
-            home.objects.link(copy)
-        objects.set_world_matrix(copy, cameras.matrices_of(module.poses())[0])
-        adopt(collection, copy, module)
-        made.append(copy)
+        for owner in camera.users_collection:
+            owner.objects.link(copy)
+        objects.set_world_matrix(copy, cameras.camera_matrices(module.poses())[0])
+        make_module(collection, copy, module)
+        copies_.append(copy)
     following.refresh(collection)
-    return made
+    return copies_
 
 
-def _place(camera: bpy.types.Object) -> NDArray[np.float64]:
+def _position(camera: bpy.types.Object) -> NDArray[np.float64]:
+    """Return the position (3,) of a camera, world mm."""
     return objects.world_matrix(camera)[:3, 3]
 
 
-def _along_ring(
+def _copied_poses(
     collection: bpy.types.Collection,
     camera: bpy.types.Object,
     module: Scanner,
     angles: NDArray[np.float64],
     follow_ring: bool,
 ) -> NDArray[np.float64]:
-    """Poses (N, 4, 4) at `angles` (N,) about z from a module's, turned as the direction to the isocentre is."""
+    """Return poses (N, 4, 4) of copies at `angles` (N,) about z from a module, which keep its tilt from the aim."""
     pose = module.poses()[0]
-    x, y, height = pose[:3, 3]
+    x, y, z = pose[:3, 3]
     azimuth, radius = np.arctan2(y, x), np.hypot(x, y)
     if follow_ring:
-        ring = [_place(o) for o in scanner.modules(collection) if o.mphdrr_module.ring == camera.mphdrr_module.ring]
-        places = np.array(ring)
+        ring = camera.mphdrr_module.ring
+        ring_positions = np.array([_position(o) for o in scanner.modules(collection) if o.mphdrr_module.ring == ring])
         # Azimuths relative to the module, so that an arc across +-pi stays in one piece.
-        others = _wrapped(np.arctan2(places[:, 1], places[:, 0]) - azimuth)
-        order = np.argsort(others)
-        radius, height = (
-            np.interp(_wrapped(angles), others[order], values[order])
-            for values in (np.hypot(*places[:, :2].T), places[:, 2])
+        azimuths = _wrap_angles(np.arctan2(ring_positions[:, 1], ring_positions[:, 0]) - azimuth)
+        order = np.argsort(azimuths)
+        radius, z = (
+            np.interp(_wrap_angles(angles), azimuths[order], values[order])
+            for values in (np.hypot(*ring_positions[:, :2].T), ring_positions[:, 2])
         )
-    to = azimuth + angles
-    there = np.column_stack(np.broadcast_arrays(radius * np.cos(to), radius * np.sin(to), height))
-    before, after = module.aimed(pose[None, :3, 3]), module.aimed(there)
-    if before is None or after is None:
+    new_azimuths = azimuth + angles
+    positions = np.column_stack(np.broadcast_arrays(radius * np.cos(new_azimuths), radius * np.sin(new_azimuths), z))
+    old_aim, new_aims = module.aimed(pose[None, :3, 3]), module.aimed(positions)
+    if old_aim is None or new_aims is None:
         turns = rotations(angles[:, None] * [0.0, 0.0, 1.0])
     else:
-        turns = after[:, :3, :3] @ before[:, :3, :3].transpose(0, 2, 1)
-    return affine_matrix(turns @ pose[:3, :3], there)
+        turns = new_aims[:, :3, :3] @ old_aim[:, :3, :3].transpose(0, 2, 1)
+    return affine_matrix(turns @ pose[:3, :3], positions)
 
 
-def _wrapped(angles: NDArray[np.float64]) -> NDArray[np.float64]:
+def _wrap_angles(angles: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return angles shifted to [-pi, pi)."""
     return (angles + np.pi) % (2 * np.pi) - np.pi
 
 
-def remove(collection: bpy.types.Collection, modules: Sequence[bpy.types.Object]) -> None:
+def remove_modules(collection: bpy.types.Collection, modules: Sequence[bpy.types.Object]) -> None:
     """Remove modules with their parts and projections in the scene; other objects parented to them stay where they are."""
     if len(modules) >= len(scanner.modules(collection)):
         raise InputError("a scanner needs at least one module: keep one, or press Remove Scanner")
@@ -222,15 +225,15 @@ def remove(collection: bpy.types.Collection, modules: Sequence[bpy.types.Object]
 def remove_scanner(scene: bpy.types.Scene, collection: bpy.types.Collection) -> None:
     """Remove a scanner, with its projections in the scene; the user's objects in it move to the scene's collection."""
     updates.FUNCTIONS["modules_removed"](scene, scanner.modules(collection))
-    _, others = parts_and_others(collection)
-    objects.remove_objects([item for item in others if item.mphdrr_module.part != "NONE"])  # copies
+    _, user_objects = parts_and_others(collection)
+    objects.remove_objects([item for item in user_objects if item.mphdrr_module.part != "NONE"])  # copied parts
     clear(scene, collection, {})
     bpy.data.collections.remove(collection)
     objects.remove_unused(bpy.data.materials.get(name) for name, _ in collimators.LOOKS.values())
 
 
 def renumber(collection: bpy.types.Collection, order: Literal["RINGS", "LIST"] = "RINGS") -> int:
-    """Number a scanner's modules 1, 2, ... in the order of `ring_order` or the present one; returns how many changed.
+    """Renumber a scanner's modules 1, 2, ... in the order of `ring_order` or the present one; return how many have changed.
 
     They are listed, projected and exported in that order from now on. Names that the user gave stay. Raises InputError
     where the scanner is untidy, or its numbers are impossible; it stays as it was.
@@ -238,81 +241,82 @@ def renumber(collection: bpy.types.Collection, order: Literal["RINGS", "LIST"] =
     untidy = untidy_text(collection)
     if untidy:
         raise InputError(f"scanner '{collection.name}': {untidy}: press Tidy Modules in the Design panel first")
-    system, found = scanner.read_scanner(collection), scanner.modules(collection)
-    places = np.arange(len(found))
+    system, cameras_ = scanner.read_scanner(collection), scanner.modules(collection)
+    indices = np.arange(len(cameras_))
     if order == "RINGS":
-        places = ring_order(system) if isinstance(system, PinholeSystem) else np.argsort(system.rings(), kind="stable")
-    parts = following.parts_of(collection, found)
+        indices = ring_order(system) if isinstance(system, PinholeSystem) else np.argsort(system.rings(), kind="stable")
+    parts = following.parts_of(collection, cameras_)
     names: list[tuple[bpy.types.ID, str]] = []
     with following.writing():
-        for index, camera in enumerate(found[place] for place in places):
+        for index, camera in enumerate(cameras_[m] for m in indices):
             camera.mphdrr_module.number, camera.mphdrr_module.index = index + 1, index
-            name = ids.module_name(index + 1, len(found), system.word)
+            name = ids.module_name(index + 1, len(cameras_), system.word)
             names += [(camera, name), (camera.data, name)]
             for part in parts[camera]:
                 part.mphdrr_module.number = index + 1
                 part_name = ids.part_name(name, part.mphdrr_module.part)
                 names += [(part, part_name), (part.data, part_name)]
         ordered = scanner.read_scanner(collection)
-        if np.any(np.diff(places) < 0):
-            collection.mphdrr_scanner.source = ""  # the workbook has another order
+        if np.any(np.diff(indices) < 0):
+            collection.mphdrr_scanner.source = ""  # the workbook's rows are in another order
         collection.mphdrr_scanner.quick_ranges = json.dumps(scanner.quick_ranges(ordered))
-    names = [(item, name) for item, name in names if item.name != name and _OURS.fullmatch(item.name)]
+    names = [(item, name) for item, name in names if item.name != name and _OUR_NAME.fullmatch(item.name)]
     for item, name in names:
-        item.name = f"{name} renumbered"  # so that the new names are free
+        item.name = f"{name} renumbered"  # frees the new names
     for item, name in names:
         item.name = name
     following.refresh(collection)
-    return int(np.count_nonzero(system.numbers[places] != ordered.numbers))
+    return int(np.count_nonzero(system.numbers[indices] != ordered.numbers))
 
 
-def can_become(collection: bpy.types.Collection, system: Scanner) -> bool:
-    """Whether a scanner has the modules of another one, by their numbers, and only the user moves them."""
-    found = scanner.modules(collection)
-    numbers = sorted(camera.mphdrr_module.number for camera in found)
+def has_modules_of(collection: bpy.types.Collection, system: Scanner) -> bool:
+    """Return whether a scanner has the module numbers and the kind of `system`, and only the user moves its modules."""
+    cameras_ = scanner.modules(collection)
+    numbers = sorted(camera.mphdrr_module.number for camera in cameras_)
     is_kind = module_values.kind_of(collection) is type(system)
-    return is_kind and numbers == sorted(system.numbers.tolist()) and all(map(following.is_free, found))
+    return is_kind and numbers == sorted(system.numbers.tolist()) and all(map(following.is_free, cameras_))
 
 
-def become(collection: bpy.types.Collection, system: Scanner) -> None:
-    """Give modules the places, directions and values that `system` has by their numbers, in float64.
+def set_modules(collection: bpy.types.Collection, system: Scanner) -> None:
+    """Give modules the positions, directions and values that `system` has by their numbers, in float64.
 
-    They are those of no workbook then. Raises InputError, and leaves the scanner as it was, unless it `can_become` this.
+    The scanner then belongs to no workbook. Raises InputError, and leaves the scanner as it was, unless it `has_modules_of`
+    the system.
     """
-    if not can_become(collection, system):
+    if not has_modules_of(collection, system):
         raise InputError(f"scanner '{collection.name}' has other modules than the one that it is to become")
     cameras_ = {camera.mphdrr_module.number: camera for camera in scanner.modules(collection)}
-    found = [cameras_[number] for number in system.numbers.tolist()]
+    ordered = [cameras_[number] for number in system.numbers.tolist()]
     with following.writing():
-        module_values.write_modules(found, system)
-        for camera, matrix in zip(found, cameras.matrices_of(system.poses()), strict=True):
+        module_values.write_modules(ordered, system)
+        for camera, matrix in zip(ordered, cameras.camera_matrices(system.poses()), strict=True):
             objects.set_world_matrix(camera, matrix)
-        if module_values.off_aim(collection, found):
+        if module_values.unaimed_numbers(collection, ordered):
             collection.mphdrr_scanner.keep_aimed = False
-    scanner.remember_source(collection, system)
+    scanner.store_saved_state(collection, system)
     following.refresh(collection, aim=False)
 
 
-def move_to(collection: bpy.types.Collection, system: PinholeSystem) -> None:
-    """Move and turn modules, with their lengths, to where `system` has those of their numbers.
+def move_modules(collection: bpy.types.Collection, system: PinholeSystem) -> None:
+    """Move and turn modules, and set their lengths, to the values that `system` has by their numbers.
 
-    From then on the scanner does not keep its modules aimed, if one is tilted. Raises InputError, and moves none, where
-    it lacks a module.
+    If one is tilted, the scanner does not keep its modules aimed from then on. Raises InputError, and moves none, where the
+    scanner lacks a module.
     """
-    found = [scanner.module(collection, number) for number in system.numbers.tolist()]
-    matrices, lengths = cameras.matrices_of(system.poses()), system.collimator_length.tolist()
+    cameras_ = [scanner.module(collection, number) for number in system.numbers.tolist()]
+    matrices, lengths = cameras.camera_matrices(system.poses()), system.collimator_length.tolist()
     with following.writing():
-        for camera, matrix, length in zip(found, matrices, lengths, strict=True):
+        for camera, matrix, length in zip(cameras_, matrices, lengths, strict=True):
             objects.set_world_matrix(camera, matrix)
             camera.mphdrr_module.collimator_length = length
             camera.mphdrr_module.length_mode = module_values.TYPED
-        if module_values.off_aim(collection, found):
+        if module_values.unaimed_numbers(collection, cameras_):
             collection.mphdrr_scanner.keep_aimed = False
     following.refresh(collection)
 
 
 def make_single_users(collection: bpy.types.Collection) -> None:
-    """Give every module a camera and meshes of its own, which can be reshaped."""
+    """Give every module its own camera data and meshes, which can be reshaped."""
     for item in collection.all_objects:
         module = item.mphdrr_module
         if (module.is_module or module.part in collimators.PARTS) and item.data.users > 1:

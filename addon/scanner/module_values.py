@@ -1,7 +1,7 @@
-"""A module's values on its camera object, numbers in float64.
+"""Values of modules, stored on their camera objects and read in float64.
 
-Blender keeps places and properties as float32. `Object.mphdrr_module.exact` has the float64 numbers beside them; each is
-valid as long as the visible one is its rounding. A number that the user has typed is read as the decimal typed.
+Blender keeps positions and properties as float32. `Object.mphdrr_module.exact` has the float64 numbers beside them; each is
+valid as long as the visible number is its rounding. A number that the user has typed is read as the decimal typed.
 """
 
 import json
@@ -24,52 +24,54 @@ from ...core.scanner_kinds import scanner_kind
 from ..blender import decimals, objects
 from . import cameras, columns
 
-FROM_ROI, TYPED = "FROM_ROI", "TYPED"  # `mphdrr_module.length_mode`
-_AIMED = 1e-4  # of a rotation's matrix, about rad
-_ROUNDING = 4e-6  # of a rotation's matrix: rotations kept as float32 angles agree to better than 1e-6
+FROM_ROI, TYPED = "FROM_ROI", "TYPED"  # values of `mphdrr_module.length_mode`
+_AIM_ERROR = 1e-4  # largest difference of a rotation matrix's elements for an aimed module, about rad
+_ROUNDING = 4e-6  # of a rotation matrix's elements: rotations kept as float32 angles agree to better than 1e-6
 
-Item = TypeVar("Item")
-Made = TypeVar("Made")
-Kind = type[Scanner]
+T = TypeVar("T")
+R = TypeVar("R")
+ScannerType = type[Scanner]
+Cameras = Sequence[bpy.types.Object]
+"""Camera objects of modules."""
 _Rows = dict[str, list[Any]]
-"""Attribute of a scanner -> its values, module by module."""
+"""Values of modules by the scanner's attribute, one list entry for each module."""
 
 
-class Placed(NamedTuple):
-    """Where modules stand."""
+class Placement(NamedTuple):
+    """Positions and directions of modules."""
 
-    poses: NDArray[np.float64]  # (M, 4, 4), as imported where they have not moved; rotations are proper ones
-    moved: NDArray[np.bool_]  # (M,): moved or turned since
-    aims: NDArray[np.float64]  # (M, 4, 4): the poses that look at the isocentre from there (`_aims`)
-    aimed: NDArray[np.bool_]  # (M,): which do so, up to rounding
+    poses: NDArray[np.float64]  # poses (M, 4, 4) with proper rotations; as imported where not moved
+    moved: NDArray[np.bool_]  # mask (M,) of the modules moved or turned since the import
+    aims: NDArray[np.float64]  # isocentre-aimed poses (M, 4, 4) at the same positions (`_aimed_poses`)
+    aimed: NDArray[np.bool_]  # mask (M,) of the modules that are aimed already, up to rounding
 
 
-def kind_of(collection: bpy.types.Collection) -> Kind:
-    """The class of a scanner in the scene."""
+def kind_of(collection: bpy.types.Collection) -> ScannerType:
+    """Return the class of a scanner in the scene."""
     return scanner_kind(collection.mphdrr_scanner.kind)
 
 
-def designed(kind: Kind) -> list[Column]:
-    """The columns of a kind that follow from the others, if nobody types them: the collimator's length."""
+def formula_columns(kind: ScannerType) -> list[Column]:
+    """Return the columns of a kind that a formula fills where nobody types them: the collimator's length."""
     return [column for column in kind.columns.scalars.values() if callable(column.blank)]
 
 
-def write_modules(cameras_: Sequence[bpy.types.Object], system: Scanner) -> None:
-    """Make objects the cameras of a system's modules; `l` follows the ROI where the design formula gives it."""
+def write_modules(cameras_: Cameras, system: Scanner) -> None:
+    """Make objects the cameras of a system's modules; `l` follows the ROI where it is equal to the design formula's."""
     rows, rings = _rows(system), system.rings().tolist()
-    follow = [column.is_default(system) for column in designed(type(system))]
+    is_default = [column.is_default(system) for column in formula_columns(type(system))]
     for m, camera in enumerate(cameras_):
         module = camera.mphdrr_module
-        for name, column in system.columns.scalars.items():  # before is_module, which lets an edit rebuild the module
-            setattr(module, name, columns.shown(column, rows[name][m]))
-        module.length_mode = FROM_ROI if follow and all(defaults[m] for defaults in follow) else TYPED
+        for name, column in system.columns.scalars.items():  # before `is_module`: then edits rebuild the module
+            setattr(module, name, columns.property_value(column, rows[name][m]))
+        module.length_mode = FROM_ROI if is_default and all(defaults[m] for defaults in is_default) else TYPED
         module.ring = rings[m]
         module.part, module.is_module = "CAMERA", True
-    remember(cameras_, system)
+    store_exact_values(cameras_, system)
 
 
-def remember(cameras_: Sequence[bpy.types.Object], system: Scanner) -> None:
-    """Store the modules of `system` as what those of the cameras were when they were imported or saved."""
+def store_exact_values(cameras_: Cameras, system: Scanner) -> None:
+    """Store the float64 values of `system` in its modules' cameras, as those of the last import or save."""
     rows, poses = _rows(system), system.poses().tolist()
     for m, camera in enumerate(cameras_):
         module = camera.mphdrr_module
@@ -79,18 +81,20 @@ def remember(cameras_: Sequence[bpy.types.Object], system: Scanner) -> None:
 
 
 def _rows(system: Scanner) -> _Rows:
+    """Return the values of all columns of a system, by attribute."""
     return {name: getattr(system, name).tolist() for name in ("numbers", *system.columns.fields)}
 
 
 def exact_values(camera: bpy.types.Object) -> dict[str, Any]:
-    """The module as imported, in float64: its attributes, its "pose" and "mode"; empty on other objects."""
-    return _parsed(camera.mphdrr_module.exact)
+    """Return a module's float64 values at its last import or save: attributes, "pose", "mode"; empty for other objects."""
+    return _parse_exact(camera.mphdrr_module.exact)
 
 
 @lru_cache(maxsize=4096)
-def _parsed(text: str) -> dict[str, Any]:
+def _parse_exact(text: str) -> dict[str, Any]:
+    """Return the values of an `exact` text, in today's form."""
     values: dict[str, Any] = json.loads(text or "{}")
-    if "center" in values:  # by versions that knew no tilt
+    if "center" in values:  # written by a version without tilts
         center = values.pop("center")
         values |= {"centers": center, "tilt": [0.0] * 3, "pose": module_poses([center])[0].tolist()}
         values["numbers"] = values.pop("number")
@@ -98,175 +102,178 @@ def _parsed(text: str) -> dict[str, Any]:
 
 
 @lru_cache(maxsize=8)
-def imported(kind: Kind, exact: tuple[str, ...]) -> Scanner:
-    """Modules as they were imported, by their `exact` texts, without their numbers, which copies share."""
-    known = [_parsed(text) for text in exact]
-    names = [name for name in kind.columns.fields if all(name in values for values in known)]
-    return kind.of({name: [values[name] for values in known] for name in names})
+def as_imported(kind: ScannerType, exact: tuple[str, ...]) -> Scanner:
+    """Return modules as they were imported, from their `exact` texts; without their numbers, which copies share."""
+    values = [_parse_exact(text) for text in exact]
+    names = [name for name in kind.columns.fields if all(name in entry for entry in values)]
+    return kind.of({name: [entry[name] for entry in values] for name in names})
 
 
-def with_design(camera: bpy.types.Object, module: Scanner) -> Scanner:
-    """A copy of a camera's module with the values by formula that follow its own, if the camera's do."""
+def with_formula_values(camera: bpy.types.Object, module: Scanner) -> Scanner:
+    """Return a module with its formula values calculated from its numbers, if the camera's length follows the formula."""
     if camera.mphdrr_module.length_mode != FROM_ROI:
         return module
-    needed = module.columns.needed_values(module)
-    return module.replace(**{column.field: column.default(needed) for column in designed(type(module))})
+    inputs = module.columns.needed_values(module)
+    return module.replace(**{column.field: column.default(inputs) for column in formula_columns(type(module))})
 
 
 def read_modules(
-    kind: Kind, cameras_: Sequence[bpy.types.Object], matrices: NDArray[np.float64], source: SystemSource | None = None
+    kind: ScannerType, cameras_: Cameras, matrices: NDArray[np.float64], source: SystemSource | None = None
 ) -> Scanner:
-    """Modules as they stand now; `matrices` (M, 4, 4) are the cameras' world matrices. Raises `InputError` if impossible.
+    """Return modules as they stand now; `matrices` (M, 4, 4) are the cameras' world matrices.
 
-    What has not changed is as imported. A camera that is turned has a tilted module, and none if it is aimed. An `l` that
-    follows the ROI is calculated in float64 once a number in its formula has changed.
+    Unchanged values are as imported. A turned camera yields a tilted module, an aimed one a module without tilt. An `l`
+    that follows the ROI is calculated in float64 once a number in its formula has changed. `InputError` for impossible
+    values.
     """
-    return _read(kind, cameras_, placed(kind, cameras_, matrices), source)
+    return _read_at(kind, cameras_, read_placement(kind, cameras_, matrices), source)
 
 
-def placed(kind: Kind, cameras_: Sequence[bpy.types.Object], matrices: NDArray[np.float64]) -> Placed:
-    """Where modules stand whose cameras have these world matrices (M, 4, 4)."""
-    poses, moved, turned = _poses(cameras_, matrices, [exact_values(camera) for camera in cameras_])
-    left, _, right = np.linalg.svd(poses[turned, :3, :3])
-    poses[turned, :3, :3] = left @ right
-    return Placed(poses, moved, *_aims(kind, poses))
+def read_placement(kind: ScannerType, cameras_: Cameras, matrices: NDArray[np.float64]) -> Placement:
+    """Return the positions and directions of modules whose cameras have these world matrices (M, 4, 4)."""
+    poses, moved, turned = _current_poses(cameras_, matrices, [exact_values(camera) for camera in cameras_])
+    u, _, vt = np.linalg.svd(poses[turned, :3, :3])
+    poses[turned, :3, :3] = u @ vt
+    return Placement(poses, moved, *_aimed_poses(kind, poses))
 
 
-def _read(
-    kind: Kind, cameras_: Sequence[bpy.types.Object], places: Placed, source: SystemSource | None = None
-) -> Scanner:
-    known = [exact_values(camera) for camera in cameras_]
-    rows = _shown(kind, cameras_, known)
-    if places.moved.any():
-        poses = np.where(places.aimed[:, None, None], places.aims, places.poses)  # without rounding
-        _carry(kind, rows, cameras_, poses, np.flatnonzero(places.moved).tolist())
-    _design(kind, rows, cameras_, known)
+def _read_at(kind: ScannerType, cameras_: Cameras, placement: Placement, source: SystemSource | None = None) -> Scanner:
+    """Return the modules of cameras at a placement."""
+    exact = [exact_values(camera) for camera in cameras_]
+    rows = _property_rows(kind, cameras_, exact)
+    if placement.moved.any():
+        poses = np.where(placement.aimed[:, None, None], placement.aims, placement.poses)  # free of rounding
+        _write_pose_attributes(kind, rows, cameras_, poses, np.flatnonzero(placement.moved).tolist())
+    _write_formula_values(kind, rows, cameras_, exact)
     return kind.of({name: np.array(row) for name, row in rows.items()} | {"source": source})
 
 
-def together(which: list[Item], make: Callable[[list[Item]], Made]) -> Iterator[tuple[list[Item], Made | InputError]]:
-    """Some things and what is made of them: of all together, but of one by one where that is refused."""
+def make_groups(items: list[T], make: Callable[[list[T]], R]) -> Iterator[tuple[list[T], R | InputError]]:
+    """Yield all items with what `make` returns for them or, where it refuses, each item with its result or error."""
     try:
-        yield which, make(which)
+        yield items, make(items)
     except InputError as error:
-        if len(which) == 1:
-            yield which, error
+        if len(items) == 1:
+            yield items, error
             return
-        for one in which:
-            yield from together([one], make)
+        for item in items:
+            yield from make_groups([item], make)
 
 
-def readings(
-    kind: Kind, cameras_: Sequence[bpy.types.Object], places: Placed
+def read_in_groups(
+    kind: ScannerType, cameras_: Cameras, placement: Placement
 ) -> Iterator[tuple[list[int], Scanner | InputError]]:
-    """Indices of modules and what is read of them at their `places`, or why there are none."""
+    """Yield groups of module indices with the modules read at their placement, or the error that refuses a module."""
 
-    def read(which: list[int]) -> Scanner:
-        return _read(kind, [cameras_[m] for m in which], Placed(*map(itemgetter(which), places)))
+    def read(indices: list[int]) -> Scanner:
+        return _read_at(kind, [cameras_[m] for m in indices], Placement(*map(itemgetter(indices), placement)))
 
-    return together(list(range(len(cameras_))), read)
+    return make_groups(list(range(len(cameras_))), read)
 
 
-def _shown(kind: Kind, cameras_: Sequence[bpy.types.Object], known: Sequence[dict[str, Any]]) -> _Rows:
-    """The modules' values by their properties, at their places as imported."""
+def _property_rows(kind: ScannerType, cameras_: Cameras, exact: Sequence[dict[str, Any]]) -> _Rows:
+    """Return the values in the modules' properties, at their positions as imported."""
     modules = [camera.mphdrr_module for camera in cameras_]
     rows: _Rows = {"numbers": [module.number for module in modules]}
     for name, (column, *_) in kind.columns.fields.items():
         if column.axis is None:
             rows[name] = [
-                columns.value_of(column, getattr(module, name), exact.get(name))
-                for module, exact in zip(modules, known, strict=True)
+                columns.column_value(column, getattr(module, name), values.get(name))
+                for module, values in zip(modules, exact, strict=True)
             ]
         else:
-            rows[name] = [exact.get(name, [0.0] * 3) for exact in known]
+            rows[name] = [values.get(name, [0.0] * 3) for values in exact]
     return rows
 
 
-def _poses(
-    cameras_: Sequence[bpy.types.Object], matrices: NDArray[np.float64], known: Sequence[dict[str, Any]]
+def _current_poses(
+    cameras_: Cameras, matrices: NDArray[np.float64], exact: Sequence[dict[str, Any]]
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_]]:
-    """The modules' poses (M, 4, 4), as imported where the cameras stand so; which (M,) are moved or turned, and turned."""
-    was = np.reshape([exact["pose"] for exact in known], (-1, 4, 4))
-    now = cameras.poses_of(matrices)
-    place, old = now[:, :3, 3], was[:, :3, 3]
-    for m, axis in np.argwhere(place.astype(np.float32) != old.astype(np.float32)).tolist():
-        if cameras_[m].parent is None and not len(cameras_[m].constraints):
-            place[m, axis] = decimals.typed(place[m, axis])
-    rounding = 4 * np.spacing(np.abs(old).max(axis=1).astype(np.float32))
-    stays = np.abs(place - old) <= rounding[:, None]
-    turned = np.abs(now[:, :3, :3] - was[:, :3, :3]).max(axis=(1, 2)) > _ROUNDING
-    place[stays] = old[stays]
-    now[~turned, :3, :3] = was[~turned, :3, :3]
-    return now, turned | ~stays.all(axis=1), turned
+    """Return the modules' present poses (M, 4, 4), a mask (M,) of moved or turned modules, and one of turned modules.
 
-
-def _aims(kind: Kind, poses: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """The poses (M, 4, 4) that look at the isocentre from the places of `poses` (M, 4, 4), and which of these do so.
-
-    Rolled ones do not. Of a kind that is not aimed, and at the isocentre itself, all are right.
+    Unmoved modules have their poses as imported.
     """
-    found, aimed, away = poses.copy(), np.ones(len(poses), bool), np.any(poses[:, :3, 3], axis=1)
-    exact = kind.aimed(poses[away, :3, 3])
-    if exact is not None:
-        found[away], aimed[away] = exact, np.abs(poses[away] - exact).max(axis=(1, 2)) <= _AIMED
-    return found, aimed
+    imported = np.reshape([values["pose"] for values in exact], (-1, 4, 4))
+    current = cameras.module_poses(matrices)
+    position, imported_position = current[:, :3, 3], imported[:, :3, 3]
+    for m, axis in np.argwhere(position.astype(np.float32) != imported_position.astype(np.float32)).tolist():
+        if cameras_[m].parent is None and not len(cameras_[m].constraints):
+            position[m, axis] = decimals.typed(position[m, axis])
+    rounding = 4 * np.spacing(np.abs(imported_position).max(axis=1).astype(np.float32))
+    is_unmoved = np.abs(position - imported_position) <= rounding[:, None]
+    is_turned = np.abs(current[:, :3, :3] - imported[:, :3, :3]).max(axis=(1, 2)) > _ROUNDING
+    position[is_unmoved] = imported_position[is_unmoved]
+    current[~is_turned, :3, :3] = imported[~is_turned, :3, :3]
+    return current, is_turned | ~is_unmoved.all(axis=1), is_turned
 
 
-def _carry(
-    kind: Kind, rows: _Rows, cameras_: Sequence[bpy.types.Object], poses: NDArray[np.float64], which: list[int]
+def _aimed_poses(kind: ScannerType, poses: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """Return the isocentre-aimed poses (M, 4, 4) at the positions of `poses`, and a mask (M,) of modules already aimed.
+
+    A rolled module is not aimed. Kinds without aiming, and modules at the isocentre, are taken as aimed.
+    """
+    aims, aimed, is_away = poses.copy(), np.ones(len(poses), bool), np.any(poses[:, :3, 3], axis=1)
+    away_aims = kind.aimed(poses[is_away, :3, 3])
+    if away_aims is not None:
+        aims[is_away], aimed[is_away] = away_aims, np.abs(poses[is_away] - away_aims).max(axis=(1, 2)) <= _AIM_ERROR
+    return aims, aimed
+
+
+def _write_pose_attributes(
+    kind: ScannerType, rows: _Rows, cameras_: Cameras, poses: NDArray[np.float64], indices: list[int]
 ) -> None:
-    """Write the attributes into `rows` that modules have at their poses; one by one where they cannot be together."""
+    """Write the attributes of modules at their poses into `rows`, one by one where that is not possible together."""
 
-    def carried(which: list[int]) -> Mapping[str, NDArray[Any]]:
-        return imported(kind, tuple(cameras_[m].mphdrr_module.exact for m in which)).attributes_at(poses[which])
+    def read_attributes(indices: list[int]) -> Mapping[str, NDArray[Any]]:
+        return as_imported(kind, tuple(cameras_[m].mphdrr_module.exact for m in indices)).attributes_at(poses[indices])
 
-    for some, there in together(which, carried):
-        if isinstance(there, InputError):
-            raise there
-        for name, values in there.items():
-            for m, value in zip(some, values.tolist(), strict=True):
+    for group, attributes in make_groups(indices, read_attributes):
+        if isinstance(attributes, InputError):
+            raise attributes
+        for name, values in attributes.items():
+            for m, value in zip(group, values.tolist(), strict=True):
                 rows[name][m] = value
 
 
-def _design(kind: Kind, rows: _Rows, cameras_: Sequence[bpy.types.Object], known: Sequence[dict[str, Any]]) -> None:
-    """Write the values that follow from the others into `rows`, as imported where these have not changed."""
-    needed = {kind.columns[name].field for name in kind.columns.needed}
-    changed = []
-    for m, (camera, exact) in enumerate(zip(cameras_, known, strict=True)):
+def _write_formula_values(kind: ScannerType, rows: _Rows, cameras_: Cameras, exact: Sequence[dict[str, Any]]) -> None:
+    """Write the values that follow from a formula into `rows`, as imported where the numbers in it have not changed."""
+    inputs = {kind.columns[name].field for name in kind.columns.needed}
+    stale = []
+    for m, (camera, values) in enumerate(zip(cameras_, exact, strict=True)):
         if camera.mphdrr_module.length_mode != FROM_ROI:
             continue
-        if exact.get("mode") == FROM_ROI and all(rows[name][m] == exact[name] for name in needed):
-            for column in designed(kind):
-                rows[column.field][m] = exact[column.field]
+        if values.get("mode") == FROM_ROI and all(rows[name][m] == values[name] for name in inputs):
+            for column in formula_columns(kind):
+                rows[column.field][m] = values[column.field]
         else:
-            changed.append(m)
-    given = SimpleNamespace(**{name: np.array([rows[name][m] for m in changed]) for name in needed})
-    for column in designed(kind) if changed else ():
-        with suppress(InputError):  # the system itself is refused for the same reason
-            for m, value in zip(changed, column.default(kind.columns.needed_values(given)).tolist(), strict=True):
+            stale.append(m)
+    arguments = SimpleNamespace(**{name: np.array([rows[name][m] for m in stale]) for name in inputs})
+    for column in formula_columns(kind) if stale else ():
+        with suppress(InputError):  # constructing the system refuses the same values
+            for m, value in zip(stale, column.default(kind.columns.needed_values(arguments)).tolist(), strict=True):
                 rows[column.field][m] = value
 
 
-def changes(found: Sequence[bpy.types.Object]) -> tuple[list[bool], list[bool]]:
-    """Which modules were moved or turned since they were imported, and of which the number or other values changed."""
-    if not found:
+def changed_modules(cameras_: Cameras) -> tuple[list[bool], list[bool]]:
+    """Return for each module whether it was moved or turned since the import, and whether its number or values changed."""
+    if not cameras_:
         return [], []
-    known = [exact_values(camera) for camera in found]
-    _, moved, _ = _poses(found, objects.world_matrices(found), known)
-    shown = {"numbers": None} | columns.known_columns()
-    edited = [
+    exact = [exact_values(camera) for camera in cameras_]
+    _, moved, _ = _current_poses(cameras_, objects.world_matrices(cameras_), exact)
+    columns_ = {"numbers": None} | columns.all_columns()
+    is_edited = [
         any(
-            columns.value_of(column, getattr(camera.mphdrr_module, name), exact[name]) != exact[name]
-            if column else camera.mphdrr_module.number != exact[name]
-            for name, column in shown.items() if name in exact
+            columns.column_value(column, getattr(camera.mphdrr_module, name), values[name]) != values[name]
+            if column else camera.mphdrr_module.number != values[name]
+            for name, column in columns_.items() if name in values
         )
-        for camera, exact in zip(found, known, strict=True)
+        for camera, values in zip(cameras_, exact, strict=True)
     ]  # fmt: skip
-    return moved.tolist(), edited
+    return moved.tolist(), is_edited
 
 
-def off_aim(collection: bpy.types.Collection, cameras_: Iterable[bpy.types.Object]) -> list[int]:
-    """Numbers of a scanner's modules whose cameras do not look at the isocentre, or are rolled."""
-    found = list(cameras_)
-    aimed = placed(kind_of(collection), found, objects.world_matrices(found)).aimed
-    return [camera.mphdrr_module.number for camera, is_aimed in zip(found, aimed, strict=True) if not is_aimed]
+def unaimed_numbers(collection: bpy.types.Collection, cameras_: Iterable[bpy.types.Object]) -> list[int]:
+    """Return the numbers of a scanner's modules whose cameras do not look at the isocentre, or are rolled."""
+    camera_list = list(cameras_)
+    aimed = read_placement(kind_of(collection), camera_list, objects.world_matrices(camera_list)).aimed
+    return [camera.mphdrr_module.number for camera, is_aimed in zip(camera_list, aimed, strict=True) if not is_aimed]

@@ -1,4 +1,4 @@
-"""What of a scanner in the scene only pinholes have: collimators' construction, the ROI sphere, readouts, checks."""
+"""Features of pinhole scanners in the scene: collimators' construction, the ROI sphere, readouts, checks."""
 
 from collections.abc import Sequence
 from dataclasses import asdict
@@ -14,43 +14,44 @@ from ...core.geometry.collimator import Construction, EdgePlace
 from ...core.geometry.finding import Finding
 from ...core.geometry.scanner import Scanner
 from ..blender.decimals import typed
-from . import collimators, module_values
+from . import collimators
+from .module_values import ScannerType
 
 _READOUTS = ("sensitivity", "resolution", "magnification", "roi_seen")
-# Both take long to be checked, and are asked for whenever a module moves.
+# Constructing either takes long, and both are needed whenever a module moves.
 _construction = lru_cache(maxsize=8)(Construction)
 _optics = lru_cache(maxsize=8)(lambda intrinsic_fwhm: Optics(intrinsic_fwhm=intrinsic_fwhm))
 
 
-def has_pinholes(kind: module_values.Kind) -> bool:
-    """Whether scanners of a kind have pinholes."""
+def has_pinholes(kind: ScannerType) -> bool:
+    """Return whether scanners of a kind have pinholes."""
     return issubclass(kind, PinholeSystem)
 
 
 def construction_values(scanner: bpy.types.PropertyGroup) -> tuple[float, float, float, EdgePlace]:
-    """The arguments of `Construction`, which may refuse them."""
+    """Return the arguments of `Construction`, which may refuse them."""
     lengths = typed(scanner.plate_thickness), typed(scanner.wall_thickness)
     return *lengths, typed(scanner.opening_angle), scanner.edge_at.lower()
 
 
-def settings(scanner: bpy.types.PropertyGroup) -> tuple[float | str, ...]:
-    """The settings of all modules that their readouts and shapes follow."""
+def readout_settings(scanner: bpy.types.PropertyGroup) -> tuple[float | str, ...]:
+    """Return the scanner's settings on which its modules' readouts and shapes depend."""
     return *construction_values(scanner), typed(scanner.intrinsic_fwhm)
 
 
-def construction(scanner: bpy.types.PropertyGroup, kind: module_values.Kind = PinholeSystem) -> Construction | None:
-    """How the scanner's collimators are built, None for a kind without; raises `InputError` where they cannot be."""
+def construction(scanner: bpy.types.PropertyGroup, kind: ScannerType = PinholeSystem) -> Construction | None:
+    """Return the construction of the scanner's collimators, None for a kind without; raise `InputError` if impossible."""
     return _construction(*construction_values(scanner)) if has_pinholes(kind) else None
 
 
 def new_roi(system: Scanner, material: bpy.types.Material) -> bpy.types.Object | None:
-    """The ROI's sphere, of a system that has one."""
+    """Return a new ROI sphere for a system that has one, else None."""
     if not isinstance(system, PinholeSystem):
         return None
     roi = bpy.data.objects.new("ROI", collimators.new_sphere("ROI", system.region_radius(), material))
     roi.mphdrr_module.part = "ROI"
     roi.hide_select = True
-    # Circles: the solid viewport draws no volume behind or inside a transparent surface. Renders show the sphere.
+    # Drawn as circles: the solid viewport draws no volume behind or inside a transparent surface. Renders show the sphere.
     roi.display_type, roi.display_bounds_type = "BOUNDS", "SPHERE"
     roi.lock_location = roi.lock_rotation = roi.lock_scale = (True, True, True)
     roi.visible_shadow = False
@@ -58,7 +59,7 @@ def new_roi(system: Scanner, material: bpy.types.Material) -> bpy.types.Object |
 
 
 def resize_roi(collection: bpy.types.Collection, modules: Sequence[bpy.types.Object]) -> None:
-    """Make the ROI's sphere, if there is one, as large as the modules' largest."""
+    """Make the ROI sphere, if there is one, as large as the largest ROI of the modules."""
     for item in collection.objects:
         if item.mphdrr_module.part == "ROI":
             radius = max((camera.mphdrr_module.roi_radius for camera in modules), default=0.0)
@@ -67,31 +68,31 @@ def resize_roi(collection: bpy.types.Collection, modules: Sequence[bpy.types.Obj
 
 
 def write_readouts(
-    found: Scanner | InputError,
+    system: Scanner | InputError,
     modules: Sequence[bpy.types.PropertyGroup],
-    which: Sequence[int],
+    indices: Sequence[int],
     scanner: bpy.types.PropertyGroup,
 ) -> None:
-    """Write the readouts of the modules `which` of a system, 0 where there is none."""
+    """Write the readouts of the modules `indices` of a system; 0 where there is an error or no pinhole."""
     values = np.zeros((len(modules), len(_READOUTS)))
-    if isinstance(found, PinholeSystem):
-        values = _readouts(found, _optics(typed(scanner.intrinsic_fwhm)))[which]
+    if isinstance(system, PinholeSystem):
+        values = _readouts(system, _optics(typed(scanner.intrinsic_fwhm)))[indices]
     for module, row in zip(modules, values.tolist(), strict=True):
         for name, value in zip(_READOUTS, row, strict=True):
             setattr(module, name, value)
 
 
 def _readouts(system: PinholeSystem, optics: Optics) -> NDArray[np.float64]:
-    """The `_READOUTS` of the modules at the isocentre, (M, 4)."""
-    at = isocentre_performance(
+    """Return the `_READOUTS` of the modules at the isocentre, (M, 4)."""
+    performance = isocentre_performance(
         system.pinhole_distance, system.pinhole_diameter, system.collimator_length, system.detector_side,
         system.detector_thickness, optics=optics,
     )  # fmt: skip
-    counts, fwhm, magnification, seen = at
-    if system.tilt.any():  # else the dimensions alone say it, which is faster
-        counts, seen = sensitivity(system, np.zeros((1, 3)))[0], system.roi_radius_seen()
+    counts, fwhm, magnification, roi_seen = performance
+    if system.tilt.any():  # without tilt, the dimensions alone suffice, which is faster
+        counts, roi_seen = sensitivity(system, np.zeros((1, 3)))[0], system.roi_radius_seen()
         fwhm = resolution(system, np.zeros((1, 3)), optics=optics)[0]
-    return np.stack([1e6 * counts, fwhm, magnification, seen], axis=1)
+    return np.stack([1e6 * counts, fwhm, magnification, roi_seen], axis=1)
 
 
 def write_totals(scanner: bpy.types.PropertyGroup, modules: Sequence[bpy.types.PropertyGroup]) -> None:
@@ -101,6 +102,6 @@ def write_totals(scanner: bpy.types.PropertyGroup, modules: Sequence[bpy.types.P
     scanner.n_covering = sum(module.sees_roi for module in modules)
 
 
-def check(scanner: bpy.types.PropertyGroup, system: PinholeSystem) -> tuple[Finding, ...]:
-    """What a check for overlaps, blocked holes and ROIs that are not seen finds."""
+def find_problems(scanner: bpy.types.PropertyGroup, system: PinholeSystem) -> tuple[Finding, ...]:
+    """Return the findings of a check for overlaps, blocked holes and ROIs that are not seen whole."""
     return checks.check_geometry(system, **asdict(_construction(*construction_values(scanner)))).findings

@@ -23,12 +23,12 @@ from ..blender import ids, objects, storage
 from ..blender.decimals import typed
 from . import cameras, collimators, following, framing, pinholes
 from .following import modules
-from .module_values import changes, kind_of, off_aim, placed, read_modules, remember
+from .module_values import changed_modules, kind_of, read_modules, read_placement, store_exact_values, unaimed_numbers
 from .scanner_parts import NewScanner, clear, losses
 
 _DEFAULT = Construction()
-_UNIT = 0.001  # m: a millimetre
-_SMALLEST_REACH = 1.0  # mm, of a scanner without modules
+_MILLIMETER = 0.001  # m
+_MIN_REACH = 1.0  # mm, radius shown of a scanner without modules
 
 
 def build_scanner(
@@ -40,12 +40,12 @@ def build_scanner(
     shape: tuple[int, int] = (256, 256),
     replace: bool = False,
 ) -> bpy.types.Collection:
-    """Put a scanner into the scene, in place of one of the same name; returns its collection.
+    """Put a scanner into the scene, in place of one of the same name, and return its collection.
 
-    `construction` is that of pinholes' collimators. One with tilted modules does not keep them aimed.
-    The scene's units become millimetres and its render resolution `shape`, pixels (n_v, n_u). The name is by default that of
-    the workbook's file. The user's objects in the old scanner move to the scene's own collection. Raises InputError, and
-    leaves the scene as it was, where a collimator cannot be built, or changes (`losses`) would be lost without `replace`.
+    `construction` is that of pinholes' collimators. A scanner with tilted modules does not keep them aimed. The scene's
+    units become millimetres and its render resolution `shape`, pixels (n_v, n_u). The name is by default that of the
+    workbook's file. The user's objects in the old scanner move to the scene's own collection. Raises InputError, and leaves
+    the scene as it was, where a collimator cannot be built, or changes (`losses`) would be lost without `replace`.
     """
     name = name or default_name(system)
     old = find_scanner(scene, name)
@@ -54,30 +54,30 @@ def build_scanner(
         raise InputError(
             f"scanner '{name}' has changed since it was imported ({'; '.join(lost)}): set replace=True to drop the changes"
         )
-    new = NewScanner(system, system.parts(construction if isinstance(system, PinholeSystem) else None))
-    hidden: set[int] = set()
+    new_scanner = NewScanner(system, system.parts(construction if isinstance(system, PinholeSystem) else None))
+    hidden_numbers: set[int] = set()
     if old is None:
         collection = bpy.data.collections.new(name)
         scene.collection.children.link(collection)
     else:
         collection = old
-        hidden = {o.mphdrr_module.number for o in modules(old) if not o.mphdrr_module.visible}
-        clear(scene, old, new.cameras)
-    new.name_and_link(collection)
-    for number in hidden & set(new.cameras):
-        set_visible(new.cameras[number], False)
+        hidden_numbers = {o.mphdrr_module.number for o in modules(old) if not o.mphdrr_module.visible}
+        clear(scene, old, new_scanner.cameras)
+    new_scanner.name_and_link(collection)
+    for number in hidden_numbers & set(new_scanner.cameras):
+        set_visible(new_scanner.cameras[number], False)
 
     properties = collection.mphdrr_scanner
     properties.scanner_name, properties.kind, properties.design = name, system.kind, ""
     for setting, value in asdict(construction).items():
         setattr(properties, setting, value.upper() if isinstance(value, str) else value)
     properties.is_scanner = properties.parts_free = True
-    if off_aim(collection, new.cameras.values()):
+    if unaimed_numbers(collection, new_scanner.cameras.values()):
         properties.keep_aimed = False
     _write_source(properties, system)
     following.refresh(collection)
 
-    first = next(iter(new.cameras.values()))
+    first = next(iter(new_scanner.cameras.values()))
     render = scene.render
     render.resolution_y, render.resolution_x, render.resolution_percentage = *shape, 100
     fit_pixels(render, first)
@@ -85,31 +85,31 @@ def build_scanner(
         set_up_scene(scene, collection)
     if scene.camera is None:
         scene.camera = first
-    scene.mphdrr_geometry.scanner = collection  # and its first module becomes active
+    scene.mphdrr_geometry.scanner = collection  # makes its first module active
     return collection
 
 
 def fit_pixels(render: bpy.types.RenderSettings, camera: bpy.types.Object) -> None:
-    """Make a picture's pixels such that it shows a module's whole field, unstretched."""
+    """Set a picture's pixel aspect so that it shows a module's whole field, unstretched."""
     *_, width, height = map(abs, cameras.field_of(camera.data))
-    longer = (width / render.resolution_x) / (height / render.resolution_y)  # how many times as wide as high a pixel is
-    render.pixel_aspect_x, render.pixel_aspect_y = max(1.0, longer), max(1.0, 1 / longer)
+    aspect = (width / render.resolution_x) / (height / render.resolution_y)  # width of a pixel over its height
+    render.pixel_aspect_x, render.pixel_aspect_y = max(1.0, aspect), max(1.0, 1 / aspect)
 
 
-def remember_source(collection: bpy.types.Collection, system: Scanner) -> None:
-    """Store `system`, which has the scanner's modules in their order, as what it was imported as: it has been saved."""
+def store_saved_state(collection: bpy.types.Collection, system: Scanner) -> None:
+    """Store `system`, with the scanner's modules in their order, as the saved state of the scanner."""
     with following.writing():
-        remember(modules(collection), system)
+        store_exact_values(modules(collection), system)
     _write_source(collection.mphdrr_scanner, system)
 
 
 def source(collection: bpy.types.Collection) -> SystemSource | None:
-    """The workbook that the scanner was read from or last written to, with its column map, even if changed since."""
+    """Return the workbook that the scanner was read from or last written to, with its column map, even if changed since."""
     values = json.loads(collection.mphdrr_scanner.source or "{}")
     if not values:
         return None
-    columns = values.get("columns")  # files of earlier versions have none
-    values["path"] = storage.absolute(collection.mphdrr_scanner.workbook or values["path"])  # it may be a copy by now
+    columns = values.get("columns")  # absent in files of earlier versions
+    values["path"] = storage.absolute(collection.mphdrr_scanner.workbook or values["path"])  # may be a copy
     values["numbers"] = tuple(values["numbers"])
     values["cells"] = tuple(QuantityCells(**{**cells, "rows": tuple(cells["rows"])}) for cells in values["cells"])
     values["columns"] = ColumnMap.from_toml(columns) if columns else None
@@ -117,10 +117,11 @@ def source(collection: bpy.types.Collection) -> SystemSource | None:
 
 
 def _write_source(properties: bpy.types.PropertyGroup, system: Scanner) -> None:
-    values, known = {}, system.source
-    if known is not None:
-        columns = "" if known.columns is None else known.columns.to_toml()
-        values = {**asdict(known), "path": str(known.path), "columns": columns}
+    """Store a system's workbook, number of modules and quick ranges in the scanner's properties."""
+    values, source = {}, system.source
+    if source is not None:
+        columns = "" if source.columns is None else source.columns.to_toml()
+        values = {**asdict(source), "path": str(source.path), "columns": columns}
     properties.source = json.dumps(values)
     properties.workbook, properties.sha256 = values.get("path", ""), values.get("sha256", "")
     properties.n_modules = len(system)
@@ -128,81 +129,81 @@ def _write_source(properties: bpy.types.PropertyGroup, system: Scanner) -> None:
 
 
 def default_name(system: Scanner) -> str:
-    """Name of a system's scanner when none is given: its workbook's, without the suffix; and its kind, unless pinhole."""
+    """Return the name for a system's scanner: its workbook's without the suffix, followed by a kind other than pinhole."""
     name = ids.SCANNER if system.source is None else system.source.path.stem or ids.SCANNER
     return name if isinstance(system, PinholeSystem) else f"{name} {system.kind}"
 
 
 def quick_ranges(system: Scanner) -> list[tuple[int, int]]:
-    """Up to three ranges (first, last) of module numbers, each of half the rings: 1-40, 21-60, 41-80 of 4 x 20."""
+    """Return up to three ranges (first, last) of module numbers, each of half the rings: 1-40, 21-60, 41-80 of 4 x 20."""
     rings, numbers = system.rings(), np.asarray(system.numbers)
     n_rings = int(rings.max()) + 1
     width = max(1, n_rings // 2)
     ranges = []
     for start in sorted({0, (n_rings - width) // 2, n_rings - width}):
-        inside = (rings >= start) & (rings < start + width)
-        first, last = int(numbers[inside].min()), int(numbers[inside].max())
-        if np.array_equal(inside, (numbers >= first) & (numbers <= last)):
+        is_inside = (rings >= start) & (rings < start + width)
+        first, last = int(numbers[is_inside].min()), int(numbers[is_inside].max())
+        if np.array_equal(is_inside, (numbers >= first) & (numbers <= last)):
             ranges.append((first, last))
     return ranges
 
 
 def set_up_scene(scene: bpy.types.Scene, collection: bpy.types.Collection, rotation: Quaternion | None = None) -> None:
-    """Set the scene's units for a scanner, and look at the whole of it, if given from the view's `rotation`."""
+    """Set the scene's units for a scanner, and turn the views to the whole scanner, seen from `rotation` if given."""
     units = scene.unit_settings
-    units.system, units.scale_length, units.length_unit = "METRIC", _UNIT, "MILLIMETERS"
+    units.system, units.scale_length, units.length_unit = "METRIC", _MILLIMETER, "MILLIMETERS"
     reaches = [o.mphdrr_module.pinhole_distance + cameras.field_of(o.data)[2] for o in modules(collection)]
-    framing.look(collection, max(reaches, default=_SMALLEST_REACH), rotation)
+    framing.frame_scanner(collection, max(reaches, default=_MIN_REACH), rotation)
 
 
 def is_set_up(scene: bpy.types.Scene) -> bool:
-    """Whether the scene's units are millimetres."""
+    """Return whether the scene's units are millimetres."""
     units = scene.unit_settings
-    return units.system == "METRIC" and abs(units.scale_length - _UNIT) < 1e-6 * _UNIT
+    return units.system == "METRIC" and abs(units.scale_length - _MILLIMETER) < 1e-6 * _MILLIMETER
 
 
 def scanners(scene: bpy.types.Scene) -> list[bpy.types.Collection]:
-    """The scanners in the scene, of the kinds that are known."""
-    found = [c for c in scene.collection.children_recursive if c.mphdrr_scanner.is_scanner]
-    return [c for c in found if c.mphdrr_scanner.kind in SCANNERS]
+    """Return the scene's scanners of known kinds."""
+    collections = [c for c in scene.collection.children_recursive if c.mphdrr_scanner.is_scanner]
+    return [c for c in collections if c.mphdrr_scanner.kind in SCANNERS]
 
 
 def find_scanner(scene: bpy.types.Scene, name: str) -> bpy.types.Collection | None:
-    """The scanner that was imported under that name, or whose collection is called so."""
-    found = scanners(scene)
-    by_name = [c for c in found if c.mphdrr_scanner.scanner_name == name] or [c for c in found if c.name == name]
-    return by_name[0] if by_name else None
+    """Return the scanner that was imported under that name, or whose collection has it; None if there is none."""
+    candidates = scanners(scene)
+    matches = [c for c in candidates if c.mphdrr_scanner.scanner_name == name]
+    return next(iter(matches or [c for c in candidates if c.name == name]), None)
 
 
 def free_name(scene: bpy.types.Scene, name: str) -> str:
-    """A name that no scanner in the scene has: this one, or with a number."""
+    """Return a name that no scanner in the scene has: `name`, or `name` with a number."""
     names = itertools.chain([name], (f"{name} {number}" for number in itertools.count(2)))
-    return next(each for each in names if find_scanner(scene, each) is None)
+    return next(candidate for candidate in names if find_scanner(scene, candidate) is None)
 
 
 def scanner_of(scene: bpy.types.Scene, item: bpy.types.Object | None) -> bpy.types.Collection | None:
-    """The scene's scanner that an object is in, the active one first; None for other objects."""
+    """Return the scene's scanner that an object is in, the active one first; None for other objects."""
     if item is None:
         return None
-    found = sorted(scanners(scene), key=lambda c: c != scene.mphdrr_geometry.scanner)
-    return next((c for c in found if c.all_objects.get(item.name) == item), None)
+    collections = sorted(scanners(scene), key=lambda c: c != scene.mphdrr_geometry.scanner)
+    return next((c for c in collections if c.all_objects.get(item.name) == item), None)
 
 
 def losses_of(scene: bpy.types.Scene, *names: str) -> list[str]:
-    """The `losses` if the scene's scanners of these names were replaced."""
-    found = filter(None, (find_scanner(scene, name) for name in names))
-    return [line for collection in found for line in losses(collection)]
+    """Return the changes that would be lost if the scene's scanners of these names were replaced (`losses`)."""
+    collections = filter(None, (find_scanner(scene, name) for name in names))
+    return [line for collection in collections for line in losses(collection)]
 
 
 def active_scanner(scene: bpy.types.Scene) -> bpy.types.Collection | None:
-    """The scanner that the panels work on: the chosen one if it is in the scene, else the first; None without one."""
-    found = scanners(scene)
+    """Return the scanner that the panels work on: the chosen one if it is in the scene, else the first; None without one."""
+    collections = scanners(scene)
     chosen = scene.mphdrr_geometry.scanner
-    return chosen if chosen in found else next(iter(found), None)
+    return chosen if chosen in collections else next(iter(collections), None)
 
 
 def required_scanner(scene: bpy.types.Scene) -> bpy.types.Collection:
-    """The scanner that the panels work on; raises `InputError` where there is none."""
+    """Return the scanner that the panels work on; raise `InputError` where there is none."""
     collection = active_scanner(scene)
     if collection is None:
         raise InputError("no scanner in the scene: import a workbook first")
@@ -210,7 +211,7 @@ def required_scanner(scene: bpy.types.Scene) -> bpy.types.Collection:
 
 
 def module(collection: bpy.types.Collection, number: int) -> bpy.types.Object:
-    """The camera object of a module; raises `InputError` where there is none."""
+    """Return the camera object of a module by its number; raise `InputError` where there is none."""
     for camera in modules(collection):
         if camera.mphdrr_module.number == number:
             return camera
@@ -218,47 +219,46 @@ def module(collection: bpy.types.Collection, number: int) -> bpy.types.Object:
 
 
 def read_scanner(collection: bpy.types.Collection) -> Scanner:
-    """The scanner as it stands in the scene now: the cameras' places and directions, and the values in their properties.
+    """Return the scanner as it stands in the scene now, from the cameras' positions and the modules' properties.
 
-    Values that have not changed come back exactly, in float64. A pinhole's camera that does not look at the isocentre, to
-    1e-4 rad, is that of a tilted module. The system has its source (the workbook) only while everything is as it was
-    imported. What a script has moved just now is followed first: Blender has not yet called for it. Raises InputError for no
+    Unchanged values come back exactly, in float64. A pinhole's camera that does not look at the isocentre, to 1e-4 rad, is
+    that of a tilted module. The system has its source (the workbook) only while everything is as it was imported. Modules
+    that a script has just moved are refreshed first: Blender has not yet called the handlers. Raises InputError for no
     modules, equal module numbers and impossible values.
     """
     following.refresh(collection)
-    found = modules(collection)
-    if not found:
+    cameras_ = modules(collection)
+    if not cameras_:
         raise InputError(f"collection '{collection.name}' has no modules: import a geometry first")
     by_number: dict[int, bpy.types.Object] = {}
-    for camera in found:
-        other = by_number.setdefault(camera.mphdrr_module.number, camera)
-        if other is not camera:
+    for camera in cameras_:
+        first = by_number.setdefault(camera.mphdrr_module.number, camera)
+        if first is not camera:
             raise InputError(
-                f"'{other.name}' and '{camera.name}' both have module number {camera.mphdrr_module.number}: "
+                f"'{first.name}' and '{camera.name}' both have module number {camera.mphdrr_module.number}: "
                 f"press Tidy Modules in the Design panel, or delete one"
             )
-    is_added = any(camera.mphdrr_module.added for camera in found)
-    as_imported = (
-        len(found) == collection.mphdrr_scanner.n_modules and not is_added and not any(map(any, changes(found)))
-    )
-    known = source(collection) if as_imported else None
-    return read_modules(kind_of(collection), found, objects.world_matrices(found), known)
+    is_added = any(camera.mphdrr_module.added for camera in cameras_)
+    is_complete = len(cameras_) == collection.mphdrr_scanner.n_modules and not is_added
+    as_imported = is_complete and not any(map(any, changed_modules(cameras_)))
+    source_ = source(collection) if as_imported else None
+    return read_modules(kind_of(collection), cameras_, objects.world_matrices(cameras_), source_)
 
 
 def sees_activity(collection: bpy.types.Collection | None) -> bool:
-    """Whether a scanner, if there is one, is of those that see activity."""
+    """Return whether a scanner images activity; True without a scanner."""
     return collection is None or "activity" in kind_of(collection).takes
 
 
-def own_pixels(collection: bpy.types.Collection) -> tuple[int, int] | None:
-    """The pixels (n_v, n_u) of a scanner's images, of a kind that says them: those of its first module."""
+def fixed_pixels(collection: bpy.types.Collection) -> tuple[int, int] | None:
+    """Return the pixels (n_v, n_u) of a scanner's images, those of its first module; None for kinds that leave them open."""
     properties = collection.mphdrr_scanner
-    says = "pixel_rows" in kind_of(collection).columns.fields
-    return (properties.pixel_rows, properties.pixel_columns) if says else None
+    has_pixels = "pixel_rows" in kind_of(collection).columns.fields
+    return (properties.pixel_rows, properties.pixel_columns) if has_pixels else None
 
 
 def read_pinholes(collection: bpy.types.Collection) -> PinholeSystem:
-    """`read_scanner` of one that must have pinholes, or `InputError`."""
+    """Return a scanner that has pinholes as it stands in the scene now; raise `InputError` for any other kind."""
     system = read_scanner(collection)
     if not isinstance(system, PinholeSystem):
         raise InputError(f"scanner '{collection.name}' has no pinholes: it is of the kind {system.kind}")
@@ -266,38 +266,39 @@ def read_pinholes(collection: bpy.types.Collection) -> PinholeSystem:
 
 
 def read_module(collection: bpy.types.Collection, camera: bpy.types.Object) -> Scanner:
-    """One module of a scanner as it stands now, as a scanner of its own."""
+    """Return one module of a scanner as it stands now, as a scanner of its own."""
     return read_modules(kind_of(collection), [camera], objects.world_matrix(camera)[None])
 
 
 def check_geometry(collection: bpy.types.Collection) -> tuple[list[str], list[bpy.types.Object]]:
     """Check the scanner as its kind is checked, beside the scene's scanners of other kinds, and store the findings.
 
-    Returns the findings, and the camera objects of the modules concerned.
+    Return the findings as texts, and the camera objects of the modules concerned.
     """
-    system, found = read_scanner(collection), modules(collection)
+    system, cameras_ = read_scanner(collection), modules(collection)
     if isinstance(system, PinholeSystem):
-        findings: Sequence[Finding] = pinholes.check(collection.mphdrr_scanner, system)
+        findings: Sequence[Finding] = pinholes.find_problems(collection.mphdrr_scanner, system)
     else:
-        others = [c for c in scanners(bpy.context.scene) if c.mphdrr_scanner.kind != system.kind]
-        built = [pinholes.construction(c.mphdrr_scanner) for c in others if pinholes.has_pinholes(kind_of(c))]
+        other_scanners = [c for c in scanners(bpy.context.scene) if c.mphdrr_scanner.kind != system.kind]
+        designs = [pinholes.construction(c.mphdrr_scanner) for c in other_scanners if pinholes.has_pinholes(kind_of(c))]
         bore = typed(collection.mphdrr_scanner.bore) or None
-        findings = system.findings([read_scanner(c) for c in others], next(iter(built), None), bore)
+        findings = system.findings([read_scanner(c) for c in other_scanners], next(iter(designs), None), bore)
     with following.writing():
         collection.mphdrr_scanner.findings = json.dumps([str(finding) for finding in findings])
-        for camera in found:
-            own = (str(finding) for finding in findings if camera.mphdrr_module.number in finding.modules)
-            camera.mphdrr_module.finding = "; ".join(own)
-    return [str(finding) for finding in findings], [camera for camera in found if camera.mphdrr_module.finding]
+        for camera in cameras_:
+            texts = (str(finding) for finding in findings if camera.mphdrr_module.number in finding.modules)
+            camera.mphdrr_module.finding = "; ".join(texts)
+    return [str(finding) for finding in findings], [camera for camera in cameras_ if camera.mphdrr_module.finding]
 
 
 def aim_modules(collection: bpy.types.Collection) -> list[int]:
-    """Turn every camera that does not look at the isocentre; returns their modules' numbers."""
-    found = modules(collection)
-    places = placed(kind_of(collection), found, objects.world_matrices(found))
+    """Turn every camera that does not look at the isocentre, and return the numbers of their modules."""
+    cameras_ = modules(collection)
+    placement = read_placement(kind_of(collection), cameras_, objects.world_matrices(cameras_))
     turned = []
-    for camera, matrix, aimed in zip(found, cameras.matrices_of(places.aims), places.aimed, strict=True):
-        if not aimed:
+    matrices = cameras.camera_matrices(placement.aims)
+    for camera, matrix, is_aimed in zip(cameras_, matrices, placement.aimed, strict=True):
+        if not is_aimed:
             objects.set_world_matrix(camera, matrix)
             turned.append(camera.mphdrr_module.number)
     following.refresh(collection)
@@ -310,23 +311,24 @@ def set_visible(camera: bpy.types.Object, visible: bool) -> None:
 
 
 def show_modules(collection: bpy.types.Collection, first: int, last: int, mode: str = "ONLY") -> int:
-    """Show modules by their numbers, first to last; returns how many are visible now.
+    """Show modules by their numbers, first to last, and return how many are visible now.
 
     `mode` is ``"SHOW"`` or ``"HIDE"``, which leave the other modules, ``"ONLY"``, or ``"ALL"``, which needs no range.
     """
-    found = modules(collection)
-    inside = {o for o in found if mode == "ALL" or first <= o.mphdrr_module.number <= last}
-    if not inside:
-        numbers = [o.mphdrr_module.number for o in found] or [0]
+    cameras_ = modules(collection)
+    chosen = {o for o in cameras_ if mode == "ALL" or first <= o.mphdrr_module.number <= last}
+    if not chosen:
+        numbers = [o.mphdrr_module.number for o in cameras_] or [0]
         raise InputError(
             f"no module between {first} and {last}: '{collection.name}' has {min(numbers)} to {max(numbers)}"
         )
-    for camera, parts in following.parts_of(collection, found).items():
-        if camera in inside or mode == "ONLY":
-            _set_hidden([camera, *parts], mode == "HIDE" or camera not in inside)
-    return sum(not camera.hide_viewport for camera in found)
+    for camera, parts in following.parts_of(collection, cameras_).items():
+        if camera in chosen or mode == "ONLY":
+            _set_hidden([camera, *parts], mode == "HIDE" or camera not in chosen)
+    return sum(not camera.hide_viewport for camera in cameras_)
 
 
 def _set_hidden(items: Iterable[bpy.types.Object], hide: bool) -> None:
+    """Show or hide objects in the viewport and in renders."""
     for item in items:
         objects.change(item, hide_viewport=hide, hide_render=hide)

@@ -1,4 +1,4 @@
-"""Scanners from workbooks, and the scene's scanner as a workbook or as another program's file."""
+"""Scanners written to workbooks and to the files of other programs."""
 
 import hashlib
 import math
@@ -18,43 +18,44 @@ from ..blender import decimals, jobs, storage
 from . import module_values, pinholes, scanner
 
 WORKBOOK_SUFFIXES = (".xlsx", ".xlsm")
+"""Endings of the names of workbooks."""
 
 
-def exporting_scanner(collection: bpy.types.Collection, path: Path, use_template: bool = True) -> jobs.Job:
-    """The job that writes the scanner as it stands in the scene to a workbook (.xlsx, .xlsm), which becomes its own.
+def export_workbook_job(collection: bpy.types.Collection, path: Path, use_template: bool = True) -> jobs.Job:
+    """Return the job that writes the scanner as it stands in the scene to a workbook, which becomes its source.
 
-    With `use_template` it is written into a copy of the scanner's present workbook, by the column map that this was read
-    by; a new one is made where that workbook has gone (`InputWarning`). Raises InputError, and leaves the scanner as it was,
-    where the file cannot be written.
+    With `use_template` it is written into a copy of the scanner's present workbook, by the column map with which that was
+    read; a new one is made where that workbook has gone (`InputWarning`). Raises InputError, and leaves the scanner as it
+    was, where the file cannot be written.
     """
     system = scanner.read_scanner(collection)
-    template = _template(collection) if use_template else None
+    template = _template_workbook(collection) if use_template else None
     source = scanner.source(collection) if template is not None else None
     columns, name = source.columns if source is not None else None, collection.name
 
     def work(progress: Progress) -> Scanner:
         stages_of(progress)("writing the workbook")
-        own = workbook.write_system(system, path, template, columns).columns
+        written_columns = workbook.write_system(system, path, template, columns).columns
         with recording.recorded_warnings():  # the writer has already warned of the template's doubts
-            written = workbook.read_scanner(path, system.kind, own)
-        different = _difference(system, written)
-        if different:
+            written = workbook.read_scanner(path, system.kind, written_columns)
+        difference = _difference(system, written)
+        if difference:
             raise InputError(
-                f"{path}: was written, but reads back differently ({different}); the scene keeps its numbers"
+                f"{path}: was written, but reads back differently ({difference}); the scene keeps its numbers"
             )
-        # The scene's own float64 numbers, which may differ in the last digit.
+        # The scene keeps its own float64 numbers, from which the workbook's may differ in the last digit.
         return system.replace(source=written.source)
 
     def finish(written: Scanner) -> str:
         collection = bpy.data.collections.get(name)
         if collection is not None:
-            scanner.remember_source(collection, written)
+            scanner.store_saved_state(collection, written)
         return f"Wrote {len(written)} modules to {path}"
 
     return jobs.Job("Exporting the workbook", work, finish)
 
 
-def exporting_for_program(
+def export_program_job(
     collection: bpy.types.Collection,
     path: Path,
     format: str,
@@ -62,27 +63,28 @@ def exporting_for_program(
     detector: Detector = "virtual",
     magnification: float = 10.0,
 ) -> jobs.Job:
-    """The job that writes the scanner as it stands in the scene in one of `FORMATS`, its collimators as they are built.
+    """Return the job that writes the scanner as it stands in the scene in one of `FORMATS`, collimators included.
 
     `path` is a new folder for formats of several files; the images described are `system.views(shape, detector, ...)`.
     Raises InputError where the format cannot express the scanner.
     """
-    built = pinholes.construction(collection.mphdrr_scanner, module_values.kind_of(collection))
-    options = {} if built is None else asdict(built)
-    if built is not None:
+    construction = pinholes.construction(collection.mphdrr_scanner, module_values.kind_of(collection))
+    options = {} if construction is None else asdict(construction)
+    if construction is not None:
         options["opening_degrees"] = decimals.typed(math.degrees(options.pop("opening_angle")))
-    system: Any = scanner.read_scanner(collection)  # of a kind that the format refuses or takes
+    system: Any = scanner.read_scanner(collection)  # `write_geometry` refuses kinds that the format cannot express
     views = system.views(shape, detector, magnification=magnification)
-    known = {name: value for name, value in options.items() if name in FORMATS[format].options}
+    arguments = {name: value for name, value in options.items() if name in FORMATS[format].options}
 
     def work(progress: Progress) -> None:
         stages_of(progress)("writing the file")
-        write_geometry(system, path, format, views=views, **known)
+        write_geometry(system, path, format, views=views, **arguments)
 
     return jobs.Job("Exporting the geometry", work, lambda _: f"Wrote {len(system)} modules to {path}")
 
 
-def _template(collection: bpy.types.Collection) -> Path | None:
+def _template_workbook(collection: bpy.types.Collection) -> Path | None:
+    """Return the scanner's present workbook, with a warning if it has changed; None, with a warning, if it is gone."""
     properties = collection.mphdrr_scanner
     if not properties.workbook:
         return None
@@ -98,11 +100,11 @@ def _template(collection: bpy.types.Collection) -> Path | None:
     return path
 
 
-def _difference(one: Scanner, other: Scanner) -> str:
-    """Where two systems differ, in words."""
-    if not np.array_equal(one.numbers, other.numbers):
+def _difference(system: Scanner, written: Scanner) -> str:
+    """Return in words the first difference between two systems; "" for none."""
+    if not np.array_equal(system.numbers, written.numbers):
         return "the modules' numbers"
-    for column in (one.columns[name] for name in one.columns.typed):
-        for i in first_true(~column.agree(column.values(other), column.values(one))):
-            return f"{column.title} of module {one.numbers[i]}"
+    for column in (system.columns[name] for name in system.columns.typed):
+        for i in first_true(~column.agree(column.values(written), column.values(system))):
+            return f"{column.title} of module {system.numbers[i]}"
     return ""

@@ -1,4 +1,4 @@
-"""Which modules an operator or a panel works on: the active one and the selected ones."""
+"""Modules that an operator or a panel works on: the active one and the selected ones."""
 
 from collections.abc import Iterable
 
@@ -11,10 +11,11 @@ SCANNER: reports.Need = (
     lambda context: scanner.active_scanner(context.scene) is not None,
     "No scanner in the scene: import a geometry first",
 )
+"""Requirement of an operator: there is a scanner."""
 
 
 def active_module(context: bpy.types.Context) -> bpy.types.Object | None:
-    """The camera of the active scanner's module that is active in the viewport (or a part of it is), else in the list."""
+    """Return the camera of the module that is active in the viewport, or whose part is; else that of the panel's list."""
     collection = scanner.active_scanner(context.scene)
     if collection is None:
         return None
@@ -25,45 +26,45 @@ def active_module(context: bpy.types.Context) -> bpy.types.Object | None:
 
 
 def listed_module(scene: bpy.types.Scene) -> bpy.types.Object | None:
-    """The camera of the module that is active in the panel's list."""
+    """Return the camera of the module that is active in the panel's list; None if there is none."""
     collection, index = scanner.active_scanner(scene), scene.mphdrr_geometry.active_index
     camera = collection.all_objects[index] if collection and 0 <= index < len(collection.all_objects) else None
     return camera if camera is not None and camera.mphdrr_module.is_module else None
 
 
 def selected_modules(context: bpy.types.Context) -> list[bpy.types.Object]:
-    """Cameras of the active scanner's modules that are selected (or a part of them is), in order; else the active one."""
+    """Return the cameras of the active scanner's selected modules (or of selected parts), in order; else the active one."""
     collection = scanner.active_scanner(context.scene)
     if collection is None:
         return []
-    chosen = {module_of(item) for item in context.view_layer.objects.selected}
+    selected = {module_of(item) for item in context.view_layer.objects.selected}
     active = active_module(context)
-    return [o for o in scanner.modules(collection) if o in chosen] or ([active] if active else [])
+    return [o for o in scanner.modules(collection) if o in selected] or ([active] if active else [])
 
 
 def module_of(item: bpy.types.Object | None) -> bpy.types.Object | None:
-    """The camera of the module that an object is or belongs to; None for other objects."""
+    """Return the camera of the module that an object is or belongs to; None for other objects."""
     if item is not None and not item.mphdrr_module.is_module and item.mphdrr_module.part != "NONE":
         item = item.parent
     return item if item is not None and item.mphdrr_module.is_module else None
 
 
 def select(context: bpy.types.Context, modules: Iterable[bpy.types.Object]) -> None:
-    """Select those of these modules' cameras that are visible, and nothing else; the first becomes active."""
+    """Select the visible ones of these modules' cameras, and nothing else; the first becomes active."""
     if context.mode != "OBJECT":
         return
     layer = context.view_layer
     for item in list(layer.objects.selected):
         item.select_set(False, view_layer=layer)
-    shown = [o for o in modules if o.name in layer.objects and o.visible_get(view_layer=layer)]
-    for camera in shown:
+    visible = [o for o in modules if o.name in layer.objects and o.visible_get(view_layer=layer)]
+    for camera in visible:
         camera.select_set(True, view_layer=layer)
-    if shown:
-        layer.objects.active = shown[0]
+    if visible:
+        layer.objects.active = visible[0]
 
 
 def after_update(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None:
-    """Another object was made active in the viewport: the panels' scanner, the list and the mosaic follow."""
+    """Make the panels' scanner, the list and the mosaic follow when another object becomes active in the viewport."""
     if not depsgraph.id_type_updated("SCENE") or scene != bpy.context.scene:
         return
     item = bpy.context.view_layer.objects.active
@@ -73,20 +74,20 @@ def after_update(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None
         return
     if collection != scanner.active_scanner(scene) or (camera is not None and camera != listed_module(scene)):
         with following.writing():
-            if scene.mphdrr_geometry.scanner != collection:  # writing it makes Blender look at all objects
+            if scene.mphdrr_geometry.scanner != collection:  # writing makes Blender search all objects
                 scene.mphdrr_geometry.scanner = collection
-            _list(scene, camera or next(iter(scanner.modules(collection)), None))
+            _activate_in_list(scene, camera or next(iter(scanner.modules(collection)), None))
         windows.redraw("IMAGE_EDITOR")  # the mosaic has a frame around the active module's image
 
 
 def scanner_chosen(scene: bpy.types.Scene) -> None:
-    """Another scanner was chosen in the panel: its first module becomes active."""
+    """Make the first module of a scanner active that was chosen in the panel."""
     collection = scanner.active_scanner(scene)
     if collection is not None and not following.is_writing():
-        _list(scene, next(iter(scanner.modules(collection)), None))
+        _activate_in_list(scene, next(iter(scanner.modules(collection)), None))
 
 
-def _list(scene: bpy.types.Scene, camera: bpy.types.Object | None) -> None:
+def _activate_in_list(scene: bpy.types.Scene, camera: bpy.types.Object | None) -> None:
     """Make a module active in the panel's list."""
     collection = scanner.active_scanner(scene)
     if camera is not None and collection is not None:
@@ -96,16 +97,16 @@ def _list(scene: bpy.types.Scene, camera: bpy.types.Object | None) -> None:
 def select_active(scene: bpy.types.Scene) -> None:
     """Select the module that is active in the panel's list, as a click on its camera would."""
     camera, layer = listed_module(scene), bpy.context.view_layer
-    if camera is None or following.is_writing():  # the list follows the viewport
+    if camera is None or following.is_writing():  # no selection while the list follows the viewport
         return
     if camera.visible_get(view_layer=layer):
         select(bpy.context, [camera])
-    elif camera.name in layer.objects and bpy.context.mode == "OBJECT":  # or the list would follow the viewport again
+    elif camera.name in layer.objects and bpy.context.mode == "OBJECT":  # else the list would follow the viewport again
         layer.objects.active = camera
 
 
 class OnScanner(reports.Reported):
-    """Mix into an operator that works on the scanner of the panels."""
+    """Mix-in of an operator that works on the scanner of the panels."""
 
     poll = reports.needs(SCANNER)
 
@@ -114,11 +115,11 @@ class OnScanner(reports.Reported):
         return self.change(context, scanner.required_scanner(context.scene))
 
     def change(self, context: bpy.types.Context, collection: bpy.types.Collection) -> str:
-        """Do the work and return the line to report; raises InputError."""
+        """Do the work and return the line to report, or raise `InputError`."""
         raise NotImplementedError
 
 
 class OnModules(OnScanner):
-    """Mix into an operator that works on the active or selected modules."""
+    """Mix-in of an operator that works on the active or selected modules."""
 
     poll = reports.needs(SCANNER, (selected_modules, "No module is selected: select a module's camera"))

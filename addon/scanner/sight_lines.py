@@ -1,4 +1,4 @@
-"""What modules look at, drawn in the 3D views and never rendered: principal rays, fields of view, virtual detectors.
+"""Sight lines of modules, drawn in the 3D views and never rendered: principal rays, fields of view, virtual detectors.
 
 The active module's collimator and crystal are tinted.
 """
@@ -13,45 +13,45 @@ from ...core.geometry.system import PinholeSystem
 from ..blender import objects, windows
 from . import cameras, following, module_values, scanner, selection
 
-# By the setting: the lines' colour, and which of the points of `lines` they join.
-_DRAWN = {
+# Colour of the lines, and pairs of indices into the points of `lines` that they join, by setting.
+_LINES = {
     "show_rays": ((1.0, 0.75, 0.2, 0.9), [(0, 5)]),
     "show_frustums": ((0.45, 0.8, 1.0, 0.35), [(0, 1), (0, 2), (0, 3), (0, 4)]),
     "show_detectors": ((0.45, 0.8, 1.0, 0.9), [(1, 2), (2, 3), (3, 4), (4, 1)]),
 }
-_TINT, _LARGER = (1.0, 0.55, 0.1, 0.55), 1.004  # of the active module's parts, drawn a little larger than they are
-_WIDTH = 1.5  # of the lines, in pixels of the screen
+_TINT, _ENLARGED = (1.0, 0.55, 0.1, 0.55), 1.004  # colour of the active module's parts, and how much larger it is drawn
+_WIDTH = 1.5  # of the lines, pixels
 _CORNERS = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)])
 
 
 def lines(context: bpy.types.Context) -> dict[str, NDArray[np.float64]]:
-    """By each setting that is on, the ends of its lines (N, 2, 3), world mm.
+    """Return the ends (N, 2, 3) of the lines, world mm, by setting that is on.
 
     A ray ends at the virtual detector of the panel's magnification; a frustum's edges lead to its corners.
     """
     scene = context.scene
     state, collection = scene.mphdrr_geometry, scanner.active_scanner(scene)
-    wanted = [name for name in _DRAWN if getattr(state, name)]
-    if collection is None or not wanted:
+    names = [name for name in _LINES if getattr(state, name)]
+    if collection is None or not names:
         return {}
     active = selection.active_module(context)
-    chosen = following.modules(collection) if state.sight_all else [active] if active else []
-    shown = [camera for camera in chosen if camera.visible_get()]
-    # A pinhole's detector is drawn magnified; that of another kind stands where it is.
+    candidates = following.modules(collection) if state.sight_all else [active] if active else []
+    visible = [camera for camera in candidates if camera.visible_get()]
+    # A pinhole's virtual detector is drawn magnified; another kind's detector is drawn where it stands.
     scale = scene.mphdrr_projections.magnification if module_values.kind_of(collection) is PinholeSystem else 1.0
-    fields = scale * np.array([cameras.field_of(o.data) for o in shown]).reshape(-1, 5)
-    local = np.zeros((len(shown), 6, 3))  # the source, the detector's corners and its middle
+    fields = scale * np.array([cameras.field_of(o.data) for o in visible]).reshape(-1, 5)
+    local = np.zeros((len(visible), 6, 3))  # source, four corners of the detector, its centre
     local[:, 1:] = (fields[:, :3] * [1, 1, -1])[:, None]
     local[:, 1:5, :2] += _CORNERS * fields[:, None, 3:] / 2
-    matrices = objects.world_matrices(shown)
+    matrices = objects.world_matrices(visible)
     points = local @ matrices[:, :3, :3].transpose(0, 2, 1) + matrices[:, None, :3, 3]
-    return {name: points[:, _DRAWN[name][1]].reshape(-1, 2, 3) for name in wanted}
+    return {name: points[:, _LINES[name][1]].reshape(-1, 2, 3) for name in names}
 
 
 def active_faces(context: bpy.types.Context) -> NDArray[np.float64]:
-    """The triangles (N, 3, 3), world mm, of the active module's collimator and crystal where they are seen."""
+    """Return the triangles (N, 3, 3), world mm, of the active module's visible collimator and crystal."""
     camera = selection.active_module(context)
-    found = [np.empty((0, 3, 3))]
+    triangles = [np.empty((0, 3, 3))]
     for part in camera.children if camera is not None else ():
         if part.mphdrr_module.part not in ("COLLIMATOR", "CRYSTAL") or not part.visible_get():
             continue
@@ -60,14 +60,14 @@ def active_faces(context: bpy.types.Context) -> NDArray[np.float64]:
         corners = np.empty((len(mesh.loop_triangles), 3), np.int32)
         mesh.vertices.foreach_get("co", points.reshape(-1))
         mesh.loop_triangles.foreach_get("vertices", corners.reshape(-1))
-        middle = points.mean(axis=0)
-        points = middle + _LARGER * (points - middle)
-        found.append((points @ matrix[:3, :3].T + matrix[:3, 3])[corners])
-    return np.concatenate(found)
+        center = points.mean(axis=0)
+        points = center + _ENLARGED * (points - center)
+        triangles.append((points @ matrix[:3, :3].T + matrix[:3, 3])[corners])
+    return np.concatenate(triangles)
 
 
 def draw() -> None:
-    """Draw them; Blender calls this for every 3D view."""
+    """Draw the sight lines and the active module's tint; Blender calls this for every 3D view."""
     context = bpy.context
     if not context.space_data.overlay.show_overlays:
         return
@@ -78,11 +78,11 @@ def draw() -> None:
         shader.uniform_float("color", _TINT)
         batch_for_shader(shader, "TRIS", {"pos": faces.reshape(-1, 3).astype(np.float32)}).draw(shader)
     for name, ends in lines(context).items():
-        windows.draw_lines(ends.reshape(-1, 3).astype(np.float32), _DRAWN[name][0], _WIDTH)
+        windows.draw_lines(ends.reshape(-1, 3).astype(np.float32), _LINES[name][0], _WIDTH)
     gpu.state.depth_test_set("NONE")
     gpu.state.blend_set("NONE")
 
 
 def redraw(*_: object) -> None:
-    """Have the 3D views drawn again: the setting was changed, perhaps by a script."""
+    """Have the 3D views drawn again after a setting was changed, perhaps by a script."""
     windows.redraw("VIEW_3D")

@@ -1,7 +1,7 @@
-"""How a volume is drawn: as smoke, or as the surface at a value; whole, or cut open in front of its slices.
+"""Looks of a volume: smoke or an isosurface, whole or cut open in front of its slices.
 
 The solid viewport knows no materials of volumes and cannot cut their smoke: where a volume has a surface or slices, it draws
-none. The surface is a mesh that Blender makes of the voxels that are shown; it goes with the object and with their changes.
+no smoke. The surface is a mesh that Blender makes of the shown voxels; it follows the object and changes of the voxels.
 """
 
 from functools import partial
@@ -14,44 +14,44 @@ from ..blender import compat, objects
 from . import vdb, volume_materials, volumes
 
 _KEY = "mphdrr_surface"  # custom property of a surface's object
-# Exponent and gain of the extinction; where a surface is drawn, the volume itself is not.
+# Exponent and gain of the extinction; looks without an entry draw a surface instead of smoke.
 _SMOKE = {"DENSITY": (1.0, 1.0), "BRIGHTEST": (3.0, 0.4)}
-_ON_SURFACE = {"SHELL": 0.6, "CUT": 0.1}  # share of the display range
-_TISSUES = {  # HU: display range and surface; linear RGB
+_SURFACE_SHARE = {"SHELL": 0.6, "CUT": 0.1}  # the surface's value as a fraction of the display range
+_TISSUES = {  # low and high end of the display range and the surface's value, HU; the surface's linear RGB
     "BONE": ((150.0, 1300.0, 250.0), (0.80, 0.68, 0.46)),
     "SOFT": ((-160.0, 240.0, -160.0), (0.72, 0.33, 0.20)),
     "LUNG": ((-1000.0, 150.0, -500.0), (0.62, 0.20, 0.17)),
 }
-_ENERGY = 140.5  # keV, at which a volume's mu is taken to hold where its file does not say
-_FINE = 160  # voxels along a side of a surface, at most
+_ENERGY = 140.5  # keV; assumed for a volume of mu whose file names no energy
+_MAX_SURFACE_VOXELS = 160  # along each side of the grid from which Blender makes a surface
 
 
-def choose(item: bpy.types.Object) -> None:
-    """Set the surface, and of tissues the display range, to where `VolumeProperties.look` has them."""
+def apply_presets(item: bpy.types.Object) -> None:
+    """Set the value of a volume's surface, and for tissues also its display range, to those of its look."""
     settings = item.mphdrr_volume
-    remove_surface(item)  # the next has the look's own colour
+    remove_surface(item)  # a new surface gets the look's colour
     if settings.look in _TISSUES and settings.quantity in volume_materials.XRAY:
         numbers, _ = _TISSUES[settings.look]
         if settings.quantity == "mu":
             path = volumes.file_of(item)
-            known = vdb.provenance_of(path) if path.is_file() else {}
-            numbers = mu_of_hu(numbers, float(known.get("energy_keV", _ENERGY))).tolist()
+            provenance = vdb.read_provenance(path) if path.is_file() else {}
+            numbers = mu_of_hu(numbers, float(provenance.get("energy_keV", _ENERGY))).tolist()
         settings.display_low, settings.display_high, settings.surface = numbers
         return
-    share = _ON_SURFACE.get(settings.look, 0.6)
+    share = _SURFACE_SHARE.get(settings.look, 0.6)
     settings.surface = settings.display_low + share * (settings.display_high - settings.display_low)
 
 
-def show(item: bpy.types.Object, cut: volume_materials.Cut | None) -> None:
-    """Draw a volume in its look and display range, cut open or whole."""
+def apply_look(item: bpy.types.Object, cut: volume_materials.Cut | None) -> None:
+    """Draw a volume in its look and display range; `cut` leaves out the part in front of its slices."""
     settings = item.mphdrr_volume
-    factor = volume_materials.shown_unit(settings.quantity)[1]
+    factor = volume_materials.display_unit(settings.quantity)[1]
     low = settings.display_low / factor
     high = max(settings.display_high / factor, low + max(1e-30, 1e-6 * abs(low)))
     exponent, gain = _SMOKE.get(settings.look, (1.0, 0.0))
     for material in filter(None, item.data.materials):
         inputs = {"Low": low, "High": high, "Exponent": exponent, "Gain": gain, "Size": settings.extent}
-        volume_materials.set_look(material, settings.quantity, **inputs)
+        volume_materials.set_look_inputs(material, settings.quantity, **inputs)
         if material.node_tree is not None:
             volume_materials.set_cut(material.node_tree, cut)
     volume_materials.set_display(item.data, low, high, settings.extent, gain if cut is None else 0.0)
@@ -59,30 +59,30 @@ def show(item: bpy.types.Object, cut: volume_materials.Cut | None) -> None:
         remove_surface(item)
         return
     surface = surface_of(item) or _new_surface(item)
-    objects.change(surface, location=_shift(item))
-    made, opened = surface.modifiers
-    voxels = "GRID" if max(settings.shape) <= _FINE else "VOXEL_AMOUNT"
-    objects.change(made, grid_name=settings.quantity, threshold=settings.surface / factor, resolution_mode=voxels)
-    volume_materials.set_cut(opened.node_group, cut)
-    objects.change(opened, show_viewport=cut is not None, show_render=cut is not None)
+    objects.change(surface, location=_surface_offset(item))
+    mesher, cutter = surface.modifiers
+    mode = "GRID" if max(settings.shape) <= _MAX_SURFACE_VOXELS else "VOXEL_AMOUNT"
+    objects.change(mesher, grid_name=settings.quantity, threshold=settings.surface / factor, resolution_mode=mode)
+    volume_materials.set_cut(cutter.node_group, cut)
+    objects.change(cutter, show_viewport=cut is not None, show_render=cut is not None)
 
 
 def surface_of(item: bpy.types.Object) -> bpy.types.Object | None:
-    """A volume's surface, if it is drawn."""
+    """Return the object of a volume's surface; None where no surface is drawn."""
     return next((child for child in item.children if _KEY in child), None)
 
 
 def remove_surface(item: bpy.types.Object) -> None:
-    """Remove a volume's surface, if it has one, with all that belongs to it."""
+    """Remove a volume's surface, if it has one, with its mesh, materials and nodes."""
     surface = surface_of(item)
     if surface is not None:
-        rest = [surface.modifiers[1].node_group, *surface.data.materials]
+        unused = [surface.modifiers[1].node_group, *surface.data.materials]
         objects.remove_objects([surface])
-        objects.remove_unused(rest)
+        objects.remove_unused(unused)
 
 
-def _shift(item: bpy.types.Object) -> Vector:
-    """What puts a surface back where the voxels' centres are: Blender makes it where it would draw their files."""
+def _surface_offset(item: bpy.types.Object) -> Vector:
+    """Return the offset, mm, from where Blender places a surface, that of the drawn voxels, to the voxels' centres."""
     item.data.grids.load()
     grid = item.data.grids.get(item.mphdrr_volume.quantity)
     if grid is None:  # its file is missing
@@ -91,31 +91,32 @@ def _shift(item: bpy.types.Object) -> Vector:
 
 
 def _new_surface(item: bpy.types.Object) -> bpy.types.Object:
+    """Return a new surface of a volume: an object with a mesh of the volume and with nodes that cut it."""
     name = f"{item.name} surface"
     mesh = bpy.data.meshes.new(name)
     settings = item.mphdrr_volume
     tissue = _TISSUES.get(settings.look) if settings.quantity in volume_materials.XRAY else None
-    mesh.materials.append(new_material(name, volume_materials.ramp_of(item, smoke=True), tissue and tissue[1]))
+    mesh.materials.append(new_material(name, volume_materials.item_ramp(item, smoke=True), tissue and tissue[1]))
     surface = bpy.data.objects.new(name, mesh)
     surface[_KEY] = True
     surface.parent, surface.hide_select = item, True
-    made = surface.modifiers.new("Surface", "VOLUME_TO_MESH")
-    made.object, made.use_smooth_shade, made.voxel_amount = item, True, _FINE
-    surface.modifiers.new("Cut", "NODES").node_group = _cutting(name)
+    modifier = surface.modifiers.new("Surface", "VOLUME_TO_MESH")
+    modifier.object, modifier.use_smooth_shade, modifier.voxel_amount = item, True, _MAX_SURFACE_VOXELS
+    surface.modifiers.new("Cut", "NODES").node_group = _cut_node_tree(name)
     objects.link_beside(surface, item)
     return surface
 
 
-def _cutting(name: str) -> bpy.types.NodeTree:
-    """A tree of geometry nodes that leaves out what is cut away."""
+def _cut_node_tree(name: str) -> bpy.types.NodeTree:
+    """Return a tree of geometry nodes that deletes the faces in front of the cut."""
     tree = bpy.data.node_groups.new(name, "GeometryNodeTree")
     for direction in ("INPUT", "OUTPUT"):
         tree.interface.new_socket("Geometry", in_out=direction, socket_type="NodeSocketGeometry")
     add_node = partial(compat.add_node, tree)
     start = add_node("NodeGroupInput", (200, 0))
-    place = add_node("GeometryNodeInputPosition", (-440, -660))
-    deleted = {"Geometry": start.outputs[0], "Selection": volume_materials.in_front(tree, place.outputs[0])}
-    delete = add_node("GeometryNodeDeleteGeometry", (440, 0), deleted, domain="FACE")
+    position = add_node("GeometryNodeInputPosition", (-440, -660))
+    selection = {"Geometry": start.outputs[0], "Selection": volume_materials.add_cut_nodes(tree, position.outputs[0])}
+    delete = add_node("GeometryNodeDeleteGeometry", (440, 0), selection, domain="FACE")
     add_node("NodeGroupOutput", (680, 0), {0: delete.outputs[0]})
     return tree
 
@@ -123,7 +124,7 @@ def _cutting(name: str) -> bpy.types.NodeTree:
 def new_material(
     name: str, colors: volume_materials.Ramp, rgb: tuple[float, float, float] | None = None
 ) -> bpy.types.Material:
-    """A dull surface in the brighter of some colours, or in a linear colour."""
+    """Return a dull material in the linear colour `rgb`, by default the second brightest of a ramp's colours."""
     material, shader = compat.surface_material(name, "ShaderNodeBsdfPrincipled")
     color = (*(rgb or colors[-2][1]), 1.0)
     material.diffuse_color = color

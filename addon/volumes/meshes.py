@@ -1,4 +1,4 @@
-"""Mesh objects of the scene as core's meshes and back, and the jobs that make volumes of them or them of volumes."""
+"""Conversion between the scene's mesh objects and core's meshes, and jobs between meshes and volumes."""
 
 from collections.abc import Sequence
 
@@ -15,10 +15,10 @@ from ...core.volumes.volume import UNITS, Volume
 from ..blender import jobs, objects
 from . import stored_volumes, volume_materials, volumes
 
-_BYTES = 40.0  # a voxel, while the volume is made and put into the scene
+_BYTES_PER_VOXEL = 40.0  # memory needed while the volume is made and put into the scene
 
 
-def voxelizing(
+def voxelize_job(
     items: Sequence[bpy.types.Object],
     value: float = 100.0,
     quantity: str = "activity",
@@ -26,21 +26,22 @@ def voxelizing(
     voxel_size: float = 0.0,
     name: str = "",
 ) -> jobs.Job:
-    """The job that makes a volume of closed mesh objects, modifiers included: a voxel holds the share that they cover.
+    """Return the job that makes a volume of closed mesh objects, modifiers included.
 
-    Later items cover earlier ones. The `value` inside is in the unit of the `quantity`, "activity" or "mu"; an object's
-    custom property of that name counts instead. `voxels` are those along the longest side; a `voxel_size` in mm, if not 0,
-    counts instead. The volume's name is by default the first mesh's.
+    A voxel at a surface holds the value times the fraction of the voxel that is covered. Later items replace earlier ones
+    where they overlap. The `value` inside is in the unit of the `quantity`, "activity" or "mu"; an object's custom property
+    of that name replaces it. `voxels` is their number along the longest side; a `voxel_size` in mm, if not 0, replaces it.
+    The volume's name is by default made from the first mesh's.
     """
     if not items:
         raise InputError("no mesh object is selected: select closed meshes first")
     values = [float(item.get(quantity, value)) for item in items]
-    solids = meshes_of(items, bpy.context.evaluated_depsgraph_get())
+    solids = evaluated_meshes(items, bpy.context.evaluated_depsgraph_get())
     vertices = np.concatenate([solid.vertices for solid in solids])
     spacing = voxel_size or float(np.ptp(vertices, axis=0).max()) / max(1, voxels - 2)
     grid = grid_around(vertices, spacing)
     shape = " x ".join(map(str, grid.shape))
-    memory.require(_BYTES * grid.n_voxels, f"a volume of {shape} voxels")
+    memory.require(_BYTES_PER_VOXEL * grid.n_voxels, f"a volume of {shape} voxels")
     name = name or f"{items[0].name} {quantity}"
     provenance = {"meshes": [item.name for item in items], "values": values}
 
@@ -52,17 +53,17 @@ def voxelizing(
         total = f"{content * 1e-3:.4g} kBq" if quantity == "activity" else f"{content:.4g} {UNITS[quantity]} mm^3"
         return f"Added {name!r}: {shape} voxels of {grid.spacing[0]:.3g} mm, {total} in all"
 
-    return volumes.adding("Voxelizing meshes", make, name, finish, provenance=provenance)
+    return volumes.add_volume_job("Voxelizing meshes", make, name, finish, provenance=provenance)
 
 
-def extracting(item: bpy.types.Object, level: float | None = None) -> jobs.Job:
-    """The job that makes a closed mesh of a volume's surface of one value, in the unit that the window shows.
+def mesh_job(item: bpy.types.Object, level: float | None = None) -> jobs.Job:
+    """Return the job that makes a closed mesh of a volume's isosurface at `level`, in the unit that the window shows.
 
-    By default it is halfway between the value outside and the largest.
+    The default level is halfway between the value outside and the largest.
     """
     read, pose, name = volumes.reader(item), volumes.pose_of_object(item), f"{item.name} surface"
     if level is not None:
-        level /= volume_materials.shown_unit(volumes.quantity_of(item))[1]
+        level /= volume_materials.display_unit(volumes.quantity_of(item))[1]
 
     def work(progress: Progress) -> Mesh:
         return volume_to_mesh(read(), level, progress)
@@ -74,8 +75,8 @@ def extracting(item: bpy.types.Object, level: float | None = None) -> jobs.Job:
     return jobs.Job("Mesh from volume", work, finish)
 
 
-def meshes_of(items: Sequence[bpy.types.Object], depsgraph: bpy.types.Depsgraph) -> list[Mesh]:
-    """What objects look like, modifiers included, in world mm; `InputError` names one that has no faces, or is open."""
+def evaluated_meshes(items: Sequence[bpy.types.Object], depsgraph: bpy.types.Depsgraph) -> list[Mesh]:
+    """Return objects as meshes, modifiers included, in world mm; `InputError` names one without faces or an open one."""
     meshes = []
     for item in items:
         evaluated = item.evaluated_get(depsgraph)
@@ -98,10 +99,10 @@ def meshes_of(items: Sequence[bpy.types.Object], depsgraph: bpy.types.Depsgraph)
 
 
 def add_mesh(mesh: Mesh, name: str, pose: NDArray[np.float64], collection: bpy.types.Collection) -> bpy.types.Object:
-    """A mesh object with its origin and axes at world-from-object `pose` (4, 4)."""
-    back = np.linalg.inv(pose)
+    """Return a new object for a mesh in world mm, with its origin and axes at the world-from-object matrix `pose` (4, 4)."""
+    object_from_world = np.linalg.inv(pose)
     data = bpy.data.meshes.new(name)
-    vertices = mesh.vertices @ back[:3, :3].T + back[:3, 3]
+    vertices = mesh.vertices @ object_from_world[:3, :3].T + object_from_world[:3, 3]
     faces = mesh.faces if np.linalg.det(pose[:3, :3]) > 0 else mesh.faces[:, ::-1]
     data.vertices.add(len(vertices))
     data.vertices.foreach_set("co", vertices.astype(np.float32).ravel())

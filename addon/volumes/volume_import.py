@@ -1,4 +1,4 @@
-"""Volumes from files, the attenuation of CTs and the dose of activity: jobs that add a volume to the scene."""
+"""Jobs that add volumes to the scene: from files, the attenuation of CTs, and the dose of activity."""
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -16,7 +16,7 @@ READ_ENDINGS = (*READ_FORMATS, ".vdb")
 """Endings of the names of files that can be read as volumes."""
 
 
-def importing(
+def import_job(
     paths: Sequence[Path],
     name: str = "",
     *,
@@ -27,20 +27,20 @@ def importing(
     unit: float = 1.0,
     frame_start: int = 1,
 ) -> jobs.Job:
-    """The job that reads a file (or the folder of a DICOM series) as a volume, or several as the states of one.
+    """Return the job that reads a file (or the folder of a DICOM series) as a volume, or several as the states of one.
 
     Parameters
     ----------
     paths, name, frame_start
         The files, the object's name (by default the first file's), and the frame of the first state.
     quantity
-        What the voxels hold, one of `UNITS`. Default: what the file says, or else activity in OpenVDB, CT numbers elsewhere.
+        Quantity of the voxels, one of `UNITS`. Default: the file's; else activity in OpenVDB, CT numbers elsewhere.
     center
         Move the (first) volume's middle to the isocentre; states move together.
     energy
         Convert CT numbers to attenuation of photons of this energy, keV.
     grid, unit
-        Of OpenVDB files, see `vdb.read_vdb`.
+        Arguments for OpenVDB files, see `vdb.read_vdb`.
     """
     count = len(paths)
     names = [path.name for path in paths]
@@ -77,62 +77,68 @@ def importing(
         return f"Imported {item.name!r}: {states}{voxels} voxels of {values}{moved}"
 
     label = "Importing a volume" if count == 1 else f"Importing {count} volumes"
-    name, home = name or name_of(paths[0]), bpy.context.collection
-    return volumes.adding(label, make, name, finish, provenance=provenance, collection=home)
+    name, collection = name or name_without_ending(paths[0]), bpy.context.collection
+    return volumes.add_volume_job(label, make, name, finish, provenance=provenance, collection=collection)
 
 
-def name_of(path: Path) -> str:
-    """A file's name without the ending by which it is read."""
+importing = import_job  # the name in version 0.2.0, for scripts
+
+
+def name_without_ending(path: Path) -> str:
+    """Return a file's name without the ending by which it is read."""
     endings = sorted(READ_ENDINGS, key=len, reverse=True)
     ending = next((e for e in endings if path.name.lower().endswith(e)), "")
     return path.name[: len(path.name) - len(ending)] or path.name
 
 
-def converting(item: bpy.types.Object, energy: float) -> jobs.Job:
-    """The job that adds the attenuation of a CT, for photons of an energy in keV; the CT stays."""
+def attenuation_job(item: bpy.types.Object, energy: float) -> jobs.Job:
+    """Return the job that adds the attenuation of a CT for photons of an energy, keV; the CT stays."""
     provenance = {"ct": item.name, "energy_keV": energy}
-    return _made_of(item, "mu", f" at {energy:g} keV", provenance, lambda ct, _: hu_to_mu(ct, energy))
+    return _derived_volume_job(item, "mu", f" at {energy:g} keV", provenance, lambda ct, _: hu_to_mu(ct, energy))
 
 
-def ct_numbers(item: bpy.types.Object) -> jobs.Job:
-    """The job that adds the CT numbers of a mu that holds at the energy of CTs; the mu stays."""
-    return _made_of(item, "CT", "", {"mu": item.name}, lambda mu, _: mu_to_hu(mu))
+def ct_numbers_job(item: bpy.types.Object) -> jobs.Job:
+    """Return the job that adds the CT numbers of a mu that holds at the energy of CTs; the mu stays."""
+    return _derived_volume_job(item, "CT", "", {"mu": item.name}, lambda mu, _: mu_to_hu(mu))
 
 
-def dosing(item: bpy.types.Object, isotope: str) -> jobs.Job:
-    """The job that adds the absorbed dose rate of an isotope's activity in water, mGy/h; the activity stays."""
+def dose_job(item: bpy.types.Object, isotope: str) -> jobs.Job:
+    """Return the job that adds the absorbed dose rate, mGy/h, of an isotope's activity in water; the activity stays."""
     provenance = {"activity": item.name, "isotope": isotope}
-    return _made_of(
+    return _derived_volume_job(
         item, "dose rate", f" of {isotope}", provenance,
         lambda activity, progress: absorbed_dose_rate(activity, isotope, progress=progress),
     )  # fmt: skip
 
 
-def _made_of(
+def _derived_volume_job(
     item: bpy.types.Object,
-    what: str,
-    how: str,
+    label: str,
+    note: str,
     provenance: dict[str, Any],
-    make_one: Callable[[Volume, Progress | None], Volume],
+    derive: Callable[[Volume, Progress | None], Volume],
 ) -> jobs.Job:
-    """The job that adds `what` is made of a volume, state by state, in its place."""
+    """Return the job that adds a volume derived from another one, state by state, in the same place.
+
+    The new volume's name ends in `label`; `note` ends the line to report.
+    """
     volumes.require_volume(item)
-    readers = [volumes.reader(item, path) for path in storage.files_of_states(item.data)]
+    readers = [volumes.reader(item, path) for path in storage.state_files(item.data)]
     count = len(readers)
     n_x, n_y, n_z = item.mphdrr_volume.shape
-    memory.require(8.0 * count * n_x * n_y * n_z, f"the {what} of {count * n_x * n_y * n_z} voxels")
+    memory.require(8.0 * count * n_x * n_y * n_z, f"the {label} of {count * n_x * n_y * n_z} voxels")
     frame_start, sequence_mode = item.data.frame_start, item.data.sequence_mode
 
     def make(progress: Progress) -> list[Volume]:
         states: list[Volume] = []
         for number, read in enumerate(readers):
             progress(number, count)
-            states.append(make_one(read(), part_of(progress, number, count)))
+            states.append(derive(read(), part_of(progress, number, count)))
         return states
 
-    def finish(made: bpy.types.Object, stored: stored_volumes.StoredVolume) -> str:
-        made.data.frame_start, made.data.sequence_mode = frame_start, sequence_mode
-        return f"Added {made.name!r}: {volumes.values_text(stored)}{how}"
+    def finish(result: bpy.types.Object, stored: stored_volumes.StoredVolume) -> str:
+        result.data.frame_start, result.data.sequence_mode = frame_start, sequence_mode
+        return f"Added {result.name!r}: {volumes.values_text(stored)}{note}"
 
-    pose, home = volumes.pose_of_object(item), item.users_collection[0]
-    return volumes.adding(f"Making {what}", make, f"{item.name} {what}", finish, pose, provenance, home)
+    pose, collection = volumes.pose_of_object(item), item.users_collection[0]
+    return volumes.add_volume_job(f"Making {label}", make, f"{item.name} {label}", finish, pose, provenance, collection)

@@ -1,6 +1,6 @@
-"""Core volumes <-> Blender's Volume objects.
+"""Core volumes as Blender's Volume objects, and back.
 
-The voxels are in .vdb files (`stored_volumes`), so that a saved .blend can be projected later. The affine in the file is
+The voxels are in .vdb files (`stored_volumes`), so that a saved .blend can be projected later. The affine in the file leads
 from voxel index to the object's own space, and the object's matrix is the pose: moving the object moves the volume.
 """
 
@@ -19,7 +19,7 @@ from ...core.geometry.frames import checked_affine
 from ...core.progress import Progress, stages_of
 from ..blender import compat, ids, jobs, objects, reports, storage
 from . import vdb, volume_materials
-from .stored_volumes import StoredVolume, moved, store_volume, write_states
+from .stored_volumes import StoredVolume, move_grid, store_volume, write_states
 
 
 def add_volume(
@@ -32,9 +32,9 @@ def add_volume(
 ) -> bpy.types.Object:
     """Put a volume into the scene as a Volume object with a material; see `store_volume` for `volume` and `pose`.
 
-    The states of something that changes, such as a beating heart, follow each other frame by frame from `frame_start` and
-    begin again after the last one (`Volume.sequence_mode`). `volume_from_object` and projections take the state of the
-    scene's current frame. Blender numbers the name if it is taken; the collection is by default the scene's own.
+    The states of a changing body, such as a beating heart, follow each other frame by frame from `frame_start` and begin
+    again after the last one (`Volume.sequence_mode`). `volume_from_object` and projections take the state of the scene's
+    current frame. Blender numbers the name if it is taken; the collection is by default the scene's own.
     """
     item = add_stored(store_volume(volume, storage.folder(), pose, provenance), name, collection)
     if item.data.is_sequence:
@@ -43,14 +43,14 @@ def add_volume(
 
 
 def add_stored(stored: StoredVolume, name: str, collection: bpy.types.Collection | None = None) -> bpy.types.Object:
-    """Put a stored volume into the scene; see `add_volume`."""
+    """Put a stored volume into the scene as a Volume object with a material."""
     item = bpy.data.objects.new(name, _volume_data(stored, name))
     (collection or bpy.context.scene.collection).objects.link(item)
-    _describe(item, stored)
+    _set_properties(item, stored)
     return item
 
 
-def adding(
+def add_volume_job(
     label: str,
     make: Callable[[Progress], Volume | Sequence[Volume]],
     name: str,
@@ -59,20 +59,20 @@ def adding(
     provenance: dict[str, Any] | None = None,
     collection: bpy.types.Collection | None = None,
 ) -> jobs.Job:
-    """The job that adds the volume, or its states, that ``make(progress)`` makes in a thread, and selects it alone.
+    """Return the job that makes a volume, or its states, in a worker thread, adds it to the scene, and selects it alone.
 
-    `finish` sets the rest of the new object and returns the line to report. The other arguments are those of `add_volume`;
-    `make` may add to the `provenance`.
+    ``make(progress)`` returns the volume and may add to the `provenance`. `finish` sets the rest of the new object and
+    returns the line to report. The other arguments are those of `add_volume`.
     """
-    folder, home_uid = storage.folder(), 0 if collection is None else collection.session_uid
+    folder, collection_uid = storage.folder(), 0 if collection is None else collection.session_uid
 
     def work(progress: Progress) -> StoredVolume:
-        made = make(progress)
+        volume = make(progress)
         stages_of(progress)("writing the voxels")
-        return store_volume(made, folder, pose, provenance)
+        return store_volume(volume, folder, pose, provenance)
 
     def finished(stored: StoredVolume) -> str:
-        item = add_stored(stored, name, jobs.found_again(bpy.data.collections, home_uid))
+        item = add_stored(stored, name, jobs.find_by_uid(bpy.data.collections, collection_uid))
         make_active(bpy.context, item)
         return finish(item, stored)
 
@@ -80,23 +80,23 @@ def adding(
 
 
 def values_text(stored: StoredVolume) -> str:
-    """Smallest and largest value as the window shows them, with their unit: "0 to 100 kBq/mL"."""
-    unit, factor = volume_materials.shown_unit(stored.volume.quantity)
+    """Return the range of a volume's values as the window shows it, with the unit: "0 to 100 kBq/mL"."""
+    unit, factor = volume_materials.display_unit(stored.volume.quantity)
     return f"{factor * stored.low:.4g} to {factor * stored.high:.4g} {unit}".removesuffix(" 1")
 
 
 def replace_stored(item: bpy.types.Object, stored: StoredVolume) -> None:
     """Give a Volume object the voxels and the pose of a stored volume.
 
-    Its datablock stays, with what the user has set on it, unless it is of another quantity or other objects show it too.
+    Its datablock stays, with the user's settings, unless it is of another quantity or other objects use it too.
     """
     old, settings = item.data, item.mphdrr_volume
-    if old.users == 1 and settings.quantity == stored.volume.quantity:  # in place: what the user set on it stays
-        _show(old, stored)
-        _describe(item, stored)
+    if old.users == 1 and settings.quantity == stored.volume.quantity:  # keeps the user's settings of the datablock
+        _load_files(old, stored)
+        _set_properties(item, stored)
         return
     item.data = data = _volume_data(stored, item.name)
-    _describe(item, stored)
+    _set_properties(item, stored)
     if old.users == 0:
         name, materials = old.name, set(old.materials)
         bpy.data.volumes.remove(old)
@@ -109,30 +109,30 @@ def make_active(context: bpy.types.Context, item: bpy.types.Object) -> None:
     if context.mode != "OBJECT":
         bpy.ops.object.mode_set(mode="OBJECT")
     volume_materials.show_in_eevee(context.scene)
-    for other in context.selected_objects:
-        other.select_set(False)
+    for selected in context.selected_objects:
+        selected.select_set(False)
     item.select_set(True)
     context.view_layer.objects.active = item
 
 
 def volume_from_object(item: bpy.types.Object) -> Volume:
-    """The exact volume that an object shows, in world mm, wherever the object has been moved, turned or scaled to."""
+    """Return the exact volume of an object in world mm, with the object's position, rotation and scale."""
     return reader(item)()
 
 
 def reader(item: bpy.types.Object, path: Path | None = None) -> Callable[[], Volume]:
-    """A function that does what `volume_from_object` does but leaves bpy alone, to be called in a thread.
+    """Return a function that reads an object's volume in world mm without bpy, for a worker thread.
 
-    `path` is the file of a state (`storage.files_of_states`); default: of the one at the current frame.
+    `path` is the file of a state (`storage.state_files`), by default that of the current frame.
     """
-    path, pose = source(item, path)
-    return lambda: moved(vdb.read_vdb(path), pose)
+    path, pose = file_and_pose(item, path)
+    return lambda: move_grid(vdb.read_vdb(path), pose)
 
 
-def source(item: bpy.types.Object, path: Path | None = None) -> tuple[Path, NDArray[np.float64]]:
-    """The file and the pose (4, 4), mm, of which `reader` makes a volume; raises InputError where there is none."""
+def file_and_pose(item: bpy.types.Object, path: Path | None = None) -> tuple[Path, NDArray[np.float64]]:
+    """Return the file with every voxel of a Volume object, and its pose (4, 4), mm; `InputError` where there is no file."""
     require_volume(item)
-    if path is None and _state(item.data) is None:
+    if path is None and _frame_number(item.data) is None:
         raise InputError(f"{item.name!r} has no state at frame {bpy.context.scene.frame_current}")
     pose, path = pose_of_object(item), path or file_of(item)
     if not path.is_file():
@@ -143,65 +143,65 @@ def source(item: bpy.types.Object, path: Path | None = None) -> tuple[Path, NDAr
 def require_volume(item: bpy.types.Object | None) -> None:
     """Raise `InputError` unless an object is one of our volumes."""
     if not is_volume(item):
-        what = "nothing is chosen" if item is None else f"{item.name!r} is no mphDRR volume"
-        raise InputError(f"{what}: add a phantom first, or choose one")
+        problem = "nothing is chosen" if item is None else f"{item.name!r} is no mphDRR volume"
+        raise InputError(f"{problem}: add a phantom first, or choose one")
 
 
 def file_of(item: bpy.types.Object) -> Path:
-    """The .vdb with every voxel of a Volume object; of a sequence, that of the current frame."""
-    path = storage.full_resolution(storage.absolute(item.data.filepath))
-    return storage.of_frame(path, _state(item.data) or 1) if item.data.is_sequence else path
+    """Return the .vdb with every voxel of a Volume object; of a sequence, that of the current frame."""
+    path = storage.full_resolution_file(storage.absolute(item.data.filepath))
+    return storage.frame_file(path, _frame_number(item.data) or 1) if item.data.is_sequence else path
 
 
-def content_of(item: bpy.types.Object) -> str:
-    """A text that tells a volume's voxels, of all its states, from others."""
+def content_key(item: bpy.types.Object) -> str:
+    """Return a text that identifies the voxels of a volume, of all its states."""
     return item.mphdrr_volume.content or bpy.path.basename(item.data.filepath)
 
 
 def state_text(item: bpy.types.Object) -> str:
-    """Which state of a sequence the current frame shows: "3 of 8"."""
-    state = _state(item.data)
+    """Return the state of a sequence at the current frame in words: "3 of 8"."""
+    state = _frame_number(item.data)
     return "none" if state is None else f"{state - item.data.frame_offset} of {item.data.frame_duration}"
 
 
-def file_state(item: bpy.types.Object) -> str:
-    """What there is to say about a Volume object's file: its size, or that it is missing."""
-    size = storage.size_of(file_of(item))
+def file_note(item: bpy.types.Object) -> str:
+    """Return the size of a Volume object's file in words, or "missing"."""
+    size = storage.file_size(file_of(item))
     if size is None:
         return "missing"
-    shown = ", coarser copy shown" if ids.PREVIEW in item.data.filepath else ""
-    kept = "" if bpy.data.filepath else ", until saved"
-    return memory.readable_size(size) + shown + kept
+    display_note = ", coarser copy shown" if ids.PREVIEW in item.data.filepath else ""
+    storage_note = "" if bpy.data.filepath else ", until saved"
+    return memory.readable_size(size) + display_note + storage_note
 
 
 def pose_of_object(item: bpy.types.Object) -> NDArray[np.float64]:
-    """World-from-object matrix (4, 4).
+    """Return an object's world-from-object matrix (4, 4), mm.
 
-    Blender keeps float32; the float64 pose that the object was given counts as long as it still rounds to Blender's.
+    Blender keeps float32; the stored float64 pose is returned as long as it rounds to Blender's.
     """
-    shown = objects.world_matrix(item)
+    matrix = objects.world_matrix(item)
     exact = item.mphdrr_volume.exact_pose
     if exact:
         pose = np.array(json.loads(exact))
-        if not pose_change(pose, shown):
+        if not pose_change(pose, matrix):
             return pose
-    return checked_affine(shown, f"{item.name}: its matrix")
+    return checked_affine(matrix, f"{item.name}: its matrix")
 
 
 def pose_change(old: NDArray[np.float64], new: NDArray[np.float64]) -> str:
-    """Whether an object "turned" or "moved" between two poses (4, 4); "" for what may be Blender's float32."""
+    """Return whether an object "turned" or "moved" between poses (4, 4); "" for a change as small as float32 rounding."""
     if not np.allclose(old[:3, :3], new[:3, :3], rtol=0, atol=2e-6):
         return "turned"
     return "" if np.allclose(old[:3, 3], new[:3, 3], rtol=1e-6, atol=1e-6) else "moved"
 
 
 def is_volume(item: bpy.types.Object | None) -> bool:
-    """Whether an object is one of our volumes."""
+    """Return whether an object is one of our volumes."""
     return item is not None and item.type == "VOLUME" and item.mphdrr_volume.is_volume
 
 
 def quantity_of(item: bpy.types.Object) -> str:
-    """What the voxels of one of our volumes hold."""
+    """Return the quantity of one of our volumes, such as "activity"."""
     return str(item.mphdrr_volume.quantity)
 
 
@@ -209,20 +209,20 @@ ACTIVE: reports.Need = (lambda context: is_volume(context.object), "No volume is
 
 
 def volume_objects(scene: bpy.types.Scene) -> list[bpy.types.Object]:
-    """Our volumes in a scene, by name."""
+    """Return our volumes in a scene, by name."""
     return sorted((item for item in scene.objects if is_volume(item)), key=lambda item: item.name)
 
 
-def meant(context: bpy.types.Context) -> bpy.types.Object | None:
-    """The volume that panels show: the active one, else the scene's only one."""
+def panel_volume(context: bpy.types.Context) -> bpy.types.Object | None:
+    """Return the volume that panels show: the active one, else the scene's only one."""
     if is_volume(context.object):
         return context.object
-    known = volume_objects(context.scene)
-    return known[0] if len(known) == 1 else None
+    scene_volumes = volume_objects(context.scene)
+    return scene_volumes[0] if len(scene_volumes) == 1 else None
 
 
 def after_load(*_: Any) -> None:
-    """Rewrite volumes of a .blend whose Blender draws voxels half a voxel elsewhere."""
+    """Bring volumes of older .blend files up to date, and rewrite those drawn half a voxel elsewhere by their Blender."""
     missing = storage.missing_volumes()
     for item in bpy.data.objects:
         if not is_volume(item):
@@ -230,31 +230,31 @@ def after_load(*_: Any) -> None:
         settings = item.mphdrr_volume
         if not settings.is_property_set("display_high"):  # made by an older version of this extension
             settings.extent = max(n * s for n, s in zip(settings.shape, settings.spacing, strict=True))
-            usual = volume_materials.usual_range(settings.quantity, 0.0, settings.maximum)
-            settings.display_low, settings.display_high = usual
-        unit, factor = volume_materials.shown_unit(settings.quantity)
-        if settings.unit != unit:  # as older versions showed it
+            usual_range = volume_materials.default_range(settings.quantity, 0.0, settings.maximum)
+            settings.display_low, settings.display_high = usual_range
+        unit, factor = volume_materials.display_unit(settings.quantity)
+        if settings.unit != unit:  # an older version's unit
             for name in ("minimum", "maximum", "display_low", "display_high"):
                 setattr(settings, name, factor * getattr(settings, name))
             settings.unit = unit
         if settings.center_shift != compat.VDB_CENTER_SHIFT and item.data not in missing:
-            settings.content = content_of(item)
+            settings.content = content_key(item)
             try:
-                states = [vdb.read_vdb(path) for path in storage.files_of_states(item.data)]
+                states = [vdb.read_vdb(path) for path in storage.state_files(item.data)]
                 item.data.filepath = storage.stored_path(write_states(states, storage.folder()))
                 settings.center_shift = compat.VDB_CENTER_SHIFT
-                settings.display_high = settings.display_high  # which draws it: its surface was elsewhere, too
+                settings.display_high = settings.display_high  # setting this draws the volume and its surface anew
             except InputError as error:
                 print(f"mphDRR: {item.name} is drawn half a voxel off: {error}")
 
 
 def _volume_data(stored: StoredVolume, name: str) -> bpy.types.Volume:
-    """Volume datablock of a stored volume, with its material."""
+    """Return a new Volume datablock of a stored volume, with its material."""
     quantity = stored.volume.quantity
     data = bpy.data.volumes.new(name)
     data.sequence_mode = "REPEAT"
     try:
-        _show(data, stored)
+        _load_files(data, stored)
     except Exception:
         bpy.data.volumes.remove(data)
         raise
@@ -265,12 +265,12 @@ def _volume_data(stored: StoredVolume, name: str) -> bpy.types.Volume:
     return data
 
 
-def _show(data: bpy.types.Volume, stored: StoredVolume) -> None:
-    """Let a datablock show a stored volume; where Blender cannot load it, it shows what it did."""
-    before = data.is_sequence, data.filepath
+def _load_files(data: bpy.types.Volume, stored: StoredVolume) -> None:
+    """Make a datablock show a stored volume; where Blender cannot load the file, it keeps the previous one."""
+    previous = data.is_sequence, data.filepath
     data.is_sequence, data.filepath = False, storage.stored_path(stored.path)
     error = ""
-    # A load that finds the file keeps the message of one that did not, as after a crash; unloading then drops it.
+    # A successful load keeps the error message of an earlier failed one, as after a crash; unloading drops it.
     data.grids.load()
     data.grids.unload()
     if not data.grids.load() or data.grids.error_message:
@@ -278,49 +278,54 @@ def _show(data: bpy.types.Volume, stored: StoredVolume) -> None:
     elif stored.volume.quantity not in data.grids:
         error = f"Blender finds no grid {stored.volume.quantity!r} in it"
     if error:
-        data.is_sequence, data.filepath = before
+        data.is_sequence, data.filepath = previous
         raise InputError(f"{stored.path}: {error}")
-    # What the solid viewport draws.
+    # The active grid is the one that the solid viewport draws.
     data.grids.active_index = data.grids.find(vdb.SMOKE if vdb.SMOKE in data.grids else stored.volume.quantity)
-    if len(stored.states) > 1:  # set after loading, which would look for frame 0 until the scene is evaluated
+    if len(stored.states) > 1:  # set after loading: a sequence would look for frame 0 until the scene is evaluated
         data.is_sequence, data.frame_duration = True, len(stored.states)
 
 
-def _state(data: bpy.types.Volume) -> int | None:
-    """Number of the file that Blender shows at the current frame, by its own rule; None where it shows none."""
-    count = data.frame_duration
+def _frame_number(data: bpy.types.Volume) -> int | None:
+    """Return the number in the name of the file that Blender shows at the current frame; None where it shows none."""
+    n_states = data.frame_duration
     if not data.is_sequence:
         return 0
     frame = bpy.context.scene.frame_current - data.frame_start  # 0: the first
-    if count == 0 or (data.sequence_mode == "CLIP" and not 0 <= frame < count):
+    if n_states == 0 or (data.sequence_mode == "CLIP" and not 0 <= frame < n_states):
         return None
     if data.sequence_mode == "EXTEND":
-        frame = min(max(frame, 0), count - 1)
+        frame = min(max(frame, 0), n_states - 1)
     elif data.sequence_mode == "REPEAT":
-        frame %= count
+        frame %= n_states
     elif data.sequence_mode == "PING_PONG":
-        frame %= max(1, 2 * count - 2)
-        frame = min(frame, 2 * count - 2 - frame)
+        frame %= max(1, 2 * n_states - 2)
+        frame = min(frame, 2 * n_states - 2 - frame)
     return frame + 1 + data.frame_offset
 
 
-def _describe(item: bpy.types.Object, stored: StoredVolume) -> None:
+def _set_properties(item: bpy.types.Object, stored: StoredVolume) -> None:
+    """Set the pose and the `VolumeProperties` of a Volume object from a stored volume.
+
+    A display range that the user has changed stays; the surface's value stays at its fraction of the display range.
+    """
     volume = stored.volume
     item.matrix_world = Matrix(stored.pose)
     settings = item.mphdrr_volume
-    low, high = shown = settings.display_low, settings.display_high
-    surface = (settings.surface - low) / ((high - low) or 1.0)  # share of the display range
-    usual = volume_materials.usual_range(settings.quantity, settings.minimum, settings.maximum)
-    unit, factor = volume_materials.shown_unit(volume.quantity)
-    chosen = settings.is_volume and settings.quantity == volume.quantity and not np.allclose(shown, usual)
+    low, high = display_range = settings.display_low, settings.display_high
+    surface_share = (settings.surface - low) / ((high - low) or 1.0)  # share of the display range
+    usual_range = volume_materials.default_range(settings.quantity, settings.minimum, settings.maximum)
+    unit, factor = volume_materials.display_unit(volume.quantity)
+    is_same_kind = settings.is_volume and settings.quantity == volume.quantity
+    is_typed = is_same_kind and not np.allclose(display_range, usual_range)
     settings.is_volume, settings.quantity, settings.unit = True, volume.quantity, unit
     settings.shape, settings.spacing = volume.grid.shape, volume.grid.spacing
     settings.minimum, settings.maximum = factor * stored.low, factor * stored.high
     settings.extent = stored.extent
     settings.exact_pose, settings.content = json.dumps(stored.pose.tolist()), stored.path.name
     settings.center_shift = compat.VDB_CENTER_SHIFT
-    if not chosen:
-        shown = volume_materials.usual_range(volume.quantity, factor * stored.low, factor * stored.high)
-    if shown != (low, high):
-        settings.surface = shown[0] + surface * (shown[1] - shown[0])
-    settings.display_low, settings.display_high = shown
+    if not is_typed:
+        display_range = volume_materials.default_range(volume.quantity, factor * stored.low, factor * stored.high)
+    if display_range != (low, high):
+        settings.surface = display_range[0] + surface_share * (display_range[1] - display_range[0])
+    settings.display_low, settings.display_high = display_range

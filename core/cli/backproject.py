@@ -1,4 +1,4 @@
-"""``mphdrr backproject RUN -o volume.nii.gz``: what the views of a run say together of each voxel."""
+"""Command ``mphdrr backproject RUN -o volume.nii.gz``: sum, geometric mean or minimum of a run's views at each voxel."""
 
 import argparse
 
@@ -7,15 +7,15 @@ from ..perspective.backprojection import HOW
 from ..runs.formats import FORMATS
 from ..runs.settings import SETTINGS
 from ..volumes.volume_files import VOLUME_FORMATS
-from .options import add_run, described, output_path, print_answer, progress_bar
-from .recipe_options import add_setting, typed_entries
+from .options import add_run, describe_volume, output_path, print_answer, progress_bar
+from .recipe_options import add_setting, entries_from_options
 
 
 def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
-    """Add the command."""
+    """Add the command ``mphdrr backproject``."""
     parser = add_run(subparsers, "backproject", _run)
     parser.add_argument("file", metavar="RUN", help=f"a run of mphDRR: {', '.join(FORMATS)}")
-    text = "of the views that see a voxel: the sum of their values, their geometric mean, or the least"
+    text = "over the views that see a voxel: the sum of their values, their geometric mean, or the smallest"
     parser.add_argument("--how", choices=tuple(HOW), default="sum", help=text)
     for name in ("voxels", "spacing", "center"):
         add_setting(parser, SETTINGS[f"reconstruction.{name}"])
@@ -27,27 +27,27 @@ def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
 
 
 def _run(arguments: argparse.Namespace) -> None:
-    """Put together what a run's views say of each voxel: sum, geometric mean or minimum.
+    """Combine the values of a run's views at each voxel: sum, geometric mean or minimum.
 
     mphdrr backproject run.h5 --how product --voxels 128 128 64 --spacing 1 -o product.nii.gz
     """
     from ..runs.backprojecting import backprojection_grid
 
     path = output_path(arguments.output, VOLUME_FORMATS)
-    counted = output_path(arguments.views_that_see, VOLUME_FORMATS) if arguments.views_that_see else None
-    if counted is not None and counted.resolve() == path.resolve():
-        raise mph.InputError(f"--views-that-see {counted}: it is the same file as --output")
+    count_path = output_path(arguments.views_that_see, VOLUME_FORMATS) if arguments.views_that_see else None
+    if count_path is not None and count_path.resolve() == path.resolve():
+        raise mph.InputError(f"--views-that-see {count_path}: it is the same file as --output")
     run = mph.read_run(arguments.file)
-    grid = backprojection_grid(run, run.recipe.updated(typed_entries(arguments)))
-    seeing = mph.views_that_see(run.views, grid, progress_bar("counting views"))
-    assert isinstance(seeing, mph.Volume)
-    if not seeing.array.any():
+    grid = backprojection_grid(run, run.recipe.updated(entries_from_options(arguments)))
+    view_counts = mph.views_that_see(run.views, grid, progress_bar("counting views"))
+    assert isinstance(view_counts, mph.Volume)
+    if not view_counts.array.any():
         raise mph.InputError("--center: no view sees any of these voxels; expected some in the field of view")
     volume = mph.backproject_run(run, arguments.how, grid=grid, stages=progress_bar)
     mph.write_volume(volume, path)
-    if counted is not None:
-        mph.write_volume(seeing, counted)
-    fewest, most = int(seeing.array.min()), int(seeing.array.max())
+    if count_path is not None:
+        mph.write_volume(view_counts, count_path)
+    fewest, largest = int(view_counts.array.min()), int(view_counts.array.max())
     record = {
         "file": str(path),
         "how": arguments.how,
@@ -57,7 +57,7 @@ def _run(arguments: argparse.Namespace) -> None:
         "smallest": float(volume.array.min()),
         "largest": float(volume.array.max()),
         "fewest_views": fewest,
-        "most_views": most,
+        "most_views": largest,
     }
-    seen_by = f"each seen by {fewest} to {most} of {len(run.views)} views"
-    print_answer(arguments, record, [f"{path}: {arguments.how}, {described(volume)}, {seen_by}"])
+    seen_by = f"each seen by {fewest} to {largest} of {len(run.views)} views"
+    print_answer(arguments, record, [f"{path}: {arguments.how}, {describe_volume(volume)}, {seen_by}"])

@@ -1,4 +1,4 @@
-"""``mphdrr export RUN -o FILE``."""
+"""Command ``mphdrr export RUN -o FILE``: a run in another format."""
 
 import argparse
 
@@ -9,7 +9,7 @@ from .options import add_run, output_path
 
 
 def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
-    """Add the command."""
+    """Add the command ``mphdrr export``."""
     parser, formats = add_run(subparsers, "export", _run), ", ".join(FORMATS)
     add = parser.add_argument
     add("file", metavar="RUN", help=f"a run written by mphDRR: {formats}")

@@ -1,4 +1,4 @@
-"""``mphdrr learn new|train|judge``: networks that reconstruct, trained on event sets, judged on others."""
+"""Command ``mphdrr learn new|train|judge``: networks that reconstruct, trained on event sets and judged on others."""
 
 import argparse
 
@@ -6,11 +6,11 @@ from .. import learning
 from ..errors import InputError
 from ..learning.networks import NETWORKS
 from ..progress import Progress
-from .options import add_actions, add_run, give_recipe, output_path, progress_bar, say
+from .options import add_actions, add_run, output_path, print_or_write_recipe, progress_bar, say
 
 
 def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
-    """Add the command."""
+    """Add the command ``mphdrr learn`` with its actions."""
     example = "mphdrr learn new -o training.toml\nexample: mphdrr learn train training.toml -o model.pt"
     actions = add_actions(subparsers, "learn", example)
     new = add_run(actions, "new", _new)
@@ -25,55 +25,57 @@ def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
     train.add_argument("--workers", type=int, default=1, metavar="N", help="processes that prepare samples")
     judge = add_run(actions, "judge", _judge)
     judge.add_argument("recipe", metavar="RECIPE", help="recipe of the judge (.toml): tests, baselines and models")
-    text = "for the table, the picture and the scores that are kept"
+    text = "folder for the table, the picture and the scores, which are kept to resume"
     judge.add_argument("-o", "--output", metavar="FOLDER", required=True, help=text)
     judge.add_argument("--into-models", action="store_true", help="also write its rows into each model's file")
-    for long in (train, judge):
-        long.add_argument("--quiet", action="store_true", help="say nothing on standard error but warnings")
+    for action in (train, judge):
+        action.add_argument("--quiet", action="store_true", help="say nothing on standard error but warnings")
 
 
 def _new(arguments: argparse.Namespace) -> None:
-    """Write a commented recipe of a training to begin with.
+    """Write a commented training recipe to start from.
 
     mphdrr learn new --like unrolled -o training.toml
     """
     from ..learning.recipe import template_text
 
-    give_recipe(template_text(arguments.like), arguments.output, "mphdrr learn train {path} -o model.pt")
+    print_or_write_recipe(template_text(arguments.like), arguments.output, "mphdrr learn train {path} -o model.pt")
 
 
 def _train(arguments: argparse.Namespace) -> None:
-    """Train a network by a recipe and write its model file; the same command goes on with what was interrupted.
+    """Train a network by a recipe and write its model file; the same command resumes an interrupted training.
 
-    mphdrr learn train training.toml -o model.pt mphdrr reconstruct run.h5 --method model.pt -o volume.nii.gz
+    mphdrr learn train training.toml -o model.pt
+    mphdrr reconstruct run.h5 --method model.pt -o volume.nii.gz
     """
     if arguments.workers < 1:
         raise InputError(f"--workers: expected 1 or more, got {arguments.workers}")
     path = output_path(arguments.output, (".pt",))
     recipe = learning.read_recipe(arguments.recipe)
     try:
-        model = learning.train(recipe, path, arguments.workers, lambda words: _stage(words, arguments.quiet))
+        model = learning.train(recipe, path, arguments.workers, lambda words: _progress(words, arguments.quiet))
     except KeyboardInterrupt:
         say(f"{path}: samples and the last checkpoint are kept; the same command goes on")
         raise
-    last = model.contents.curve[-1]
-    print(f"{path}: {model.label}, {last['step']} steps, NRMSE {last['validation']:.3f} of the validation")
+    end = model.contents.curve[-1]
+    print(f"{path}: {model.label}, {end['step']} steps, NRMSE {end['validation']:.3f} of the validation")
 
 
 def _judge(arguments: argparse.Namespace) -> None:
-    """Judge models beside tuned baselines: one table and one picture; the same command goes on with what was interrupted.
+    """Judge models beside tuned baselines: one table and one picture; the same command resumes an interrupted judgement.
 
     mphdrr learn judge judge.toml -o judgement
     """
     recipe = learning.read_judge_recipe(arguments.recipe)
     models = {name: learning.read_model(path) for name, path in recipe.models.items()}
     methods = [model.judged(name) for name, model in models.items()]
-    found = learning.judge(recipe, arguments.output, methods, _stage("judging", arguments.quiet))
+    judgement = learning.judge(recipe, arguments.output, methods, _progress("judging", arguments.quiet))
     for name, model in models.items() if arguments.into_models else ():
-        rows = [row for row in found.rows if row["method"] == name]
-        learning.with_judgement(model.path, {**found.record, "rows": rows})
-    print(f"{arguments.output}: {len(found.rows)} rows in judgement.md, .json and .png")
+        rows = [row for row in judgement.rows if row["method"] == name]
+        learning.with_judgement(model.path, {**judgement.record, "rows": rows})
+    print(f"{arguments.output}: {len(judgement.rows)} rows in judgement.md, .json and .png")
 
 
-def _stage(words: str, is_quiet: bool) -> Progress | None:
-    return None if is_quiet else progress_bar(words)
+def _progress(title: str, is_quiet: bool) -> Progress | None:
+    """Return a progress bar with a title, None if nothing is to be shown."""
+    return None if is_quiet else progress_bar(title)

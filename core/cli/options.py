@@ -1,4 +1,4 @@
-"""Options and parsing that several commands share."""
+"""Options, parsing and output that several commands share."""
 
 import argparse
 import inspect
@@ -21,35 +21,36 @@ if TYPE_CHECKING:  # the parser of all commands reads this file, and numpy takes
 COMMANDS = {
     "geometry": "work on a geometry workbook",
     "phantom": "make a phantom volume",
-    "volume": "look at volumes and convert them",
-    "project": "project a volume, or a phantom, into every module; or take measured counts for the projections",
+    "volume": "inspect volumes and convert them",
+    "project": "project a volume, or a phantom, into every module; or use measured counts as the projections",
     "counts": "find dead and hot pixels in measured counts",
-    "reconstruct": "reconstruct the volume that a run's images are of",
-    "backproject": "put together what a run's views say of each voxel: sum, geometric mean or minimum",
-    "score": "score a reconstructed volume beside the truth: what a run was simulated of, a phantom, or a volume",
-    "xray": "motion seen by X rays, kerma of a CT, absorbed dose",
+    "reconstruct": "reconstruct the volume from the images of a run",
+    "backproject": "combine the values of a run's views at each voxel: sum, geometric mean or minimum",
+    "score": "score a reconstructed volume against the truth: the volume of a simulated run, a phantom, or a volume",
+    "xray": "find motion by X rays; compute air kerma and absorbed dose",
     "events": "make sets of training events from a recipe",
-    "learn": "train networks that reconstruct",
-    "design": "design a scanner by gradients",
+    "learn": "train and judge networks that reconstruct",
+    "design": "design a scanner by gradient-based optimisation",
     "export": "write a projection run in another format",
 }
-"""What the commands do, by their modules here; those modules are imported when their options are wanted."""
+"""Module of a command -> its summary in the help; the module is imported only when its options are needed."""
 
-_HANGING = 15 * " "  # under the second column of lists in descriptions
+_HANGING = 15 * " "  # indent of further lines in the second column of lists in descriptions
 
 
 class _HelpFormatter(argparse.HelpFormatter):
-    """Shows the defaults that say something, lists as they are typed; keeps the lines of descriptions."""
+    """Help formatter that shows informative defaults, lists as they are typed, and keeps the lines of descriptions."""
 
     def _fill_text(self, text: str, width: int, indent: str) -> str:
-        return "\n".join(
-            textwrap.fill(
-                line, width, initial_indent=indent, subsequent_indent=indent + _HANGING * line.startswith(" ")
-            )
-            for line in text.splitlines()
-        )
+        """Return a description with its lines kept and wrapped to `width`; list items, which begin with a blank, hang."""
+        paragraphs = []
+        for line in text.splitlines():
+            hanging = indent + _HANGING * line.startswith(" ")
+            paragraphs.append(textwrap.fill(line, width, initial_indent=indent, subsequent_indent=hanging))
+        return "\n".join(paragraphs)
 
     def _get_help_string(self, action: argparse.Action) -> str | None:
+        """Return an option's help text with its default, unless that is None, False, empty or suppressed."""
         if action.help is None or action.default in (None, [], False, argparse.SUPPRESS):
             return action.help
         default = action.default if isinstance(action.default, list) else [action.default]
@@ -57,50 +58,50 @@ class _HelpFormatter(argparse.HelpFormatter):
 
 
 class NotingStore(argparse.Action):
-    """Stores an option's value, and notes that it was typed, so that `refuse` can tell it from a default."""
+    """Action that stores an option's value and notes that it was typed, so that `refuse` can tell it from a default."""
 
     def __call__(
         self, parser: argparse.ArgumentParser, namespace: argparse.Namespace, values: Any, option_string: Any = None
     ) -> None:
-        """Called by argparse."""
+        """Store the value; argparse calls this for each typed option."""
         if "" in (values if isinstance(values, list) else [values]):
             parser.error(f"argument {'/'.join(self.option_strings) or self.metavar or self.dest}: got an empty text")
         setattr(namespace, self.dest, values)
         vars(namespace).setdefault("typed", {})[self.dest] = option_string
 
 
-def refuse(arguments: argparse.Namespace, names: Iterable[str], why: str) -> None:
-    """Refuse options that were typed, by the `names` they are stored as: the message names the option and `why` not."""
-    noted = getattr(arguments, "typed", {})
+def refuse(arguments: argparse.Namespace, names: Iterable[str], reason: str) -> None:
+    """Raise `InputError` if one of the options stored under `names` was typed, with the option and the `reason`."""
+    typed = getattr(arguments, "typed", {})
     for name in names:
-        if name in noted or getattr(arguments, name, None) is True:  # a flag
-            raise InputError(f"{noted.get(name, '--' + name.replace('_', '-'))} {why}")
+        if name in typed or getattr(arguments, name, None) is True:  # a flag
+            raise InputError(f"{typed.get(name, '--' + name.replace('_', '-'))} {reason}")
 
 
 def add_run(subparsers: Any, name: str, run: Callable[[argparse.Namespace], None]) -> argparse.ArgumentParser:
-    """The parser of a command that calls `run`, whose docstring is the help: what it does, and below it examples."""
-    summary, _, below = inspect.cleandoc(run.__doc__ or "").partition("\n\n")
-    words = " ".join(summary.split()).rstrip(".")
-    words = words[0].lower() + words[1:] if words[1].islower() else words
-    examples = re.split(r"\s+(?=mphdrr )", below)
-    return add_command(subparsers, name, words, "\nexample: ".join(" ".join(each.split()) for each in examples), run)
+    """Add a command that calls `run` and return its parser; the help is the docstring of `run`: a sentence, examples."""
+    summary, _, example_text = inspect.cleandoc(run.__doc__ or "").partition("\n\n")
+    sentence = " ".join(summary.split()).rstrip(".")
+    sentence = sentence[0].lower() + sentence[1:] if sentence[1].islower() else sentence
+    examples = re.split(r"\s+(?=mphdrr )", example_text)
+    return add_command(subparsers, name, sentence, "\nexample: ".join(" ".join(text.split()) for text in examples), run)
 
 
 def add_command(subparsers, name: str, summary: str, example: str, run: Any = None) -> argparse.ArgumentParser:  # type: ignore[no-untyped-def]
-    """A command's parser, its help ending in an example; `run` is called with the parsed arguments."""
-    words = {"description": f"{summary[0].upper()}{summary[1:]}.", "epilog": f"example: {example}"}
-    parser = subparsers.add_parser(name, help=summary, **words, formatter_class=_HelpFormatter)
+    """Add a command and return its parser, whose help ends in an example; `run` is called with the parsed arguments."""
+    texts = {"description": f"{summary[0].upper()}{summary[1:]}.", "epilog": f"example: {example}"}
+    parser = subparsers.add_parser(name, help=summary, **texts, formatter_class=_HelpFormatter)
     parser.set_defaults(run=run)
     return parser
 
 
 def add_actions(subparsers: Any, name: str, example: str, metavar: str = "ACTION") -> Any:
-    """The subparsers of a command of `COMMANDS` that consists of actions."""
+    """Add a command of `COMMANDS` that consists of actions, and return the subparsers to which these are added."""
     return add_command(subparsers, name, COMMANDS[name], example).add_subparsers(metavar=metavar, required=True)
 
 
-def described(volume: "Volume") -> str:
-    """A volume's voxels and the range of its values, for people: ``64 x 64 x 64 voxels, 0 to 4.2``."""
+def describe_volume(volume: "Volume") -> str:
+    """Return a volume's voxels and the range of its values as text: ``64 x 64 x 64 voxels, 0 to 4.2``."""
     voxels, values = " x ".join(map(str, volume.grid.shape)), volume.array
     return f"{voxels} voxels, {float(values.min()):.4g} to {float(values.max()):.4g}"
 
@@ -115,15 +116,15 @@ def print_answer(arguments: argparse.Namespace, record: Any, lines: Iterable[str
     print("\n".join(lines))
 
 
-def one_or_three(values: list) -> list:
-    """The numbers along x, y and z of an option that takes one for all."""
+def expand_to_three(values: list) -> list:
+    """Return the numbers along x, y and z of an option that takes three numbers, or one for all axes."""
     return values * 3 if len(values) == 1 else values
 
 
 def output_path(text: str, suffixes: tuple[str, ...] = ()) -> Path:
-    """A file to write, its name ending in one of `suffixes` if any; its folder is made when it is missing.
+    """Return the path of a file to write, whose name must end in one of `suffixes` if any are given.
 
-    Called before the long work, so that what cannot be written fails at once.
+    A missing folder is made. This is called before the long work, so that a file that cannot be written is refused at once.
     """
     path = Path(text)
     if suffixes:
@@ -134,25 +135,25 @@ def output_path(text: str, suffixes: tuple[str, ...] = ()) -> Path:
 
 
 def new_recipe_path(text: str) -> Path:
-    """`output_path` of a recipe (.toml) to begin with; one that is there was edited by hand, and is not overwritten."""
+    """Return `output_path` of a new recipe (.toml); raise `InputError` for an existing file, which was edited by hand."""
     path = output_path(text, (".toml",))
     if path.exists():
         raise InputError(f"{path}: it exists; choose another name, or remove it first")
     return path
 
 
-def give_recipe(text: str, output: str | None, then: str) -> None:
-    """Print a recipe to begin with, or write it to a new file and say what comes `then`, a command with {path}."""
+def print_or_write_recipe(text: str, output: str | None, next_command: str) -> None:
+    """Print a recipe to start from, or write it to a new file and name the `next_command`, in which {path} is the file."""
     if output is None:
         print(text, end="")
         return
     path = new_recipe_path(output)
     write_bytes(path, text.encode())
-    print(f"{path}: edit it, then: {then.format(path=path)}")
+    print(f"{path}: edit it, then: {next_command.format(path=path)}")
 
 
 def numbered_path(path: Path, number: int, count: int) -> Path:
-    """The name of one of `count` files: train-007.nii.gz for train.nii.gz, or `path` itself where it is the only one."""
+    """Return the name of one of `count` files: train-007.nii.gz for train.nii.gz, or `path` itself if it is the only one."""
     if count == 1:
         return path
     suffix = ".nii.gz" if path.name.lower().endswith(".nii.gz") else path.suffix
@@ -160,39 +161,40 @@ def numbered_path(path: Path, number: int, count: int) -> Path:
     return path.with_name(f"{path.name[:end]}-{number:0{len(str(count))}}{path.name[end:]}")
 
 
-def number_or_name(text: str) -> float | str:
-    """What an option's text is that takes a number or the name of something."""
+def parse_number_or_name(text: str) -> float | str:
+    """Parse an option's text as a number, or return it unchanged as a name."""
     try:
         return float(text)
     except ValueError:
         return text
 
 
-def counted(number: int, word: str) -> str:
-    """A number of things, such as "1 fault" or "2 faults"."""
-    return f"{number} {word}{'s' * (number != 1)}"
+def count_text(number: int, noun: str) -> str:
+    """Return a number with its noun, such as "1 fault" or "2 faults"."""
+    return f"{number} {noun}{'s' * (number != 1)}"
 
 
 def say(text: str) -> None:
-    """Write a line on standard error; on a terminal in the place of a bar that is not at its end."""
+    """Print a line on standard error; on a terminal it replaces an unfinished progress bar."""
     over = "\r\x1b[K" if sys.stderr.isatty() else ""
     print(f"{over}mphdrr: {text}", file=sys.stderr, flush=True)
 
 
-def progress_bar(label: str, more: Callable[[], str] | None = None) -> Progress:
-    """A progress callback that draws a bar on standard error when that is a terminal, and says nothing otherwise.
+def progress_bar(label: str, status_text: Callable[[], str] | None = None) -> Progress:
+    """Return a progress callback that draws a bar on standard error if that is a terminal, and prints nothing otherwise.
 
-    The bar ends in the seconds that went by, or in what `more` says.
+    Behind the bar stand the elapsed seconds, or the text that `status_text` returns.
     """
-    started, width = time.monotonic(), 30
+    start_time, width = time.monotonic(), 30
 
-    def show(done: int, total: int) -> None:
+    def show(n_done: int, total: int) -> None:
+        """Draw the bar; a finished one ends its line."""
         if not sys.stderr.isatty():
             return
-        filled = width * done // max(total, 1)
-        words = f"{time.monotonic() - started:.1f} s" if more is None else more()
-        end = "\n" if done >= total else ""
+        filled = width * n_done // max(total, 1)
+        text = f"{time.monotonic() - start_time:.1f} s" if status_text is None else status_text()
+        end = "\n" if n_done >= total else ""
         bar = f"[{'#' * filled}{'.' * (width - filled)}]"
-        print(f"\r{label} {bar} {done}/{total}  {words}\x1b[K", end=end, file=sys.stderr, flush=True)
+        print(f"\r{label} {bar} {n_done}/{total}  {text}\x1b[K", end=end, file=sys.stderr, flush=True)
 
     return show

@@ -1,4 +1,4 @@
-"""``mphdrr project WORKBOOK --volume FILE -o run.h5``, ``mphdrr project run.toml -o run.h5``.
+"""Commands ``mphdrr project WORKBOOK --volume FILE -o run.h5`` and ``mphdrr project run.toml -o run.h5``.
 
 Every setting of `runs.settings` is an option; the help lists the most used ones.
 """
@@ -18,7 +18,7 @@ from ..runs.mosaic import write_sheet
 from ..runs.presets import PRESETS
 from ..runs.settings import SETTINGS
 from .options import add_run, numbered_path, output_path, progress_bar
-from .recipe_options import add_entries, add_option, add_setting, typed_entries
+from .recipe_options import add_entries, add_option, add_setting, entries_from_options
 
 _LISTED = (
     *("system.columns", "system.modules", "volume.file", "volume.states", "volume.center", "phantom.file"),
@@ -26,11 +26,12 @@ _LISTED = (
     *("attenuation.file", "model.time", "model.isotope", "model.hole", "detector.plane", "detector.magnification"),
     *("noise.seed", "compute.backend", "compute.threads"),
 )
-"""Settings whose options the help lists; the others it leaves to --set and the recipe."""
+"""Settings whose options are in the help; it leaves the others to --set and the recipe."""
 
-_BY_HAND = ("model.kind", "model.photons", "detector.rows", "detector.columns", "volume.energy")
+_OWN_OPTIONS = ("model.kind", "model.photons", "detector.rows", "detector.columns", "volume.energy")
+"""Settings whose options are not made from the table of settings."""
 
-# Options of the Derenzo phantom by the settings that they stand for.
+# Option of the Derenzo phantom -> the settings that it stands for.
 _DERENZO = {
     "--radius": ("phantom.radius",),
     "--rods": ("phantom.rod_diameters",),
@@ -43,12 +44,12 @@ _DERENZO = {
 
 
 def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
-    """Add the command."""
+    """Add the command ``mphdrr project``."""
     parser = add_run(subparsers, "project", _run)
-    text = "geometry workbook (.xlsx, .xlsm), recipe (.toml), or run (.h5, .npz, .pt), to be made again"
+    text = "geometry workbook (.xlsx, .xlsm), recipe (.toml), or run (.h5, .npz, .pt) to be made again"
     parser.add_argument("file", nargs="?", metavar="FILE", help=text)
     for setting in SETTINGS.values():
-        if setting.key not in _BY_HAND and not setting.key.startswith("reconstruction."):
+        if setting.key not in _OWN_OPTIONS and not setting.key.startswith("reconstruction."):
             add_setting(parser, setting, setting.key in _LISTED)
     size = ("detector.rows", "detector.columns")
     add_option(parser, "--size", size, "Pixels, rows and columns (default: 256 256)", nargs=2)
@@ -69,26 +70,29 @@ def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
     parser.add_argument("--mosaic", metavar="PNG", help="also write all images in one picture")
 
 
-def _changes(arguments: argparse.Namespace, recipe: mph.Recipe) -> dict[str, Any]:
-    """What the options change, by the keys of recipes."""
-    typed, changes = vars(arguments), typed_entries(arguments)
+def _changes_from_options(arguments: argparse.Namespace, recipe: mph.Recipe) -> dict[str, Any]:
+    """Return the recipe entries that the options change, by key; None marks an entry to delete."""
+    typed, changes = vars(arguments), entries_from_options(arguments)
     if changes.get("model.photons") is not None:
         changes.setdefault("model.kind", "transmission")
     if changes.get("counts.files") is not None:
         changes.setdefault("model.kind", "emission")
     if "energy" in typed:
-        # Counts are of activity: the CT numbers are those of the attenuation.
+        # Counts come from an activity, so the CT numbers are those of the attenuation.
         is_counts = changes.get("model.kind", recipe["model.kind"]) == "emission"
         changes["attenuation.energy" if is_counts else "volume.energy"] = typed["energy"]
     if changes.get("phantom.file") in [kind.name for kind in KINDS]:
         changes["phantom.kind"] = changes.pop("phantom.file")
-    if any(key.startswith("phantom.") for key in changes):  # then it is not the object of the scene any more
+    if any(key.startswith("phantom.") for key in changes):  # the phantom replaces an object of the scene
         changes.setdefault("volume.object", None)
     return changes
 
 
-def _chosen(arguments: argparse.Namespace) -> tuple[mph.Recipe, dict[str, Any]]:
-    """The recipe of the options, and from a run that it began with the scanner and the volume if it still has them."""
+def _recipe_and_data(arguments: argparse.Namespace) -> tuple[mph.Recipe, dict[str, Any]]:
+    """Return the recipe of the options, and the scanner and the volume of a given run as far as the recipe keeps them.
+
+    The latter are keyword arguments of `run_recipe`: "system" and "volume".
+    """
     file, recipe, run = arguments.file, mph.Recipe(), None
     suffix = Path(file or "").suffix.lower()
     if suffix == ".toml":
@@ -98,31 +102,31 @@ def _chosen(arguments: argparse.Namespace) -> tuple[mph.Recipe, dict[str, Any]]:
         recipe = run.recipe
     elif file is not None:
         recipe = mph.Recipe({"system.file": file})
-    before = recipe.tables()
+    old_tables = recipe.tables()
     preset = {} if arguments.preset is None else PRESETS[arguments.preset].changes
     recipe = recipe.updated(preset)
-    isotope = {key: preset[key] for key in preset if key == "model.isotope"}  # which images of photons alone have
-    recipe = recipe.updated({**isotope, **_changes(arguments, recipe)})
+    preset_isotope = {key: preset[key] for key in preset if key == "model.isotope"}  # only a model of photons has it
+    recipe = recipe.updated({**preset_isotope, **_changes_from_options(arguments, recipe)})
     if run is None:
         return recipe, {}
-    now = recipe.tables()
-    kept: dict[str, Any] = {}
-    if now.get("system") == before.get("system"):
-        kept["system"] = run.system
-    # An attenuation that is made with the volume, or moved with it, needs the volume made anew.
-    together = recipe["attenuation.of_phantom"] or (recipe["volume.center"] and "attenuation" in now)
-    if not together and all(now.get(table) == before.get(table) for table in ("volume", "phantom")):
+    new_tables = recipe.tables()
+    data: dict[str, Any] = {}
+    if new_tables.get("system") == old_tables.get("system"):
+        data["system"] = run.system
+    # An attenuation that is made or moved together with the volume needs a new volume.
+    is_made_together = recipe["attenuation.of_phantom"] or (recipe["volume.center"] and "attenuation" in new_tables)
+    if not is_made_together and all(new_tables.get(table) == old_tables.get(table) for table in ("volume", "phantom")):
         if run.volume is None and recipe["counts.files"] is None:
-            found = "it holds measured counts, not what was measured"
-            raise mph.InputError(f"{file}: {found}; name a volume, a phantom, or --counts")
-        kept["volume"] = run.volume
-        if run.recipe["model.kind"] == recipe["model.kind"] == "spectral":  # whose runs hold mu at that energy
+            problem = "it holds measured counts, not what was measured"
+            raise mph.InputError(f"{file}: {problem}; name a volume, a phantom, or --counts")
+        data["volume"] = run.volume
+        if run.recipe["model.kind"] == recipe["model.kind"] == "spectral":  # a spectral run holds mu at this energy
             recipe = recipe.updated({"volume.energy": CT_ENERGY})
-    return recipe, kept
+    return recipe, data
 
 
 def _run(arguments: argparse.Namespace) -> None:
-    """Project a volume, or a phantom, into every module; or take measured counts for the projections.
+    """Project a volume, or a phantom, into every module; or use measured counts as the projections.
 
     mphdrr project scanner.xlsx --volume ct.nii.gz --energy 60 --size 250 250 -o run.h5
     mphdrr project scanner.xlsx --volume heart.nii.gz --mu ct-mu.nii.gz --preset tc99m-tungsten-czt --time 600
@@ -135,7 +139,7 @@ def _run(arguments: argparse.Namespace) -> None:
 
     if arguments.write_recipe:
         path = output_path(arguments.write_recipe, (".toml",))
-        recipe, _ = _chosen(arguments)
+        recipe, _ = _recipe_and_data(arguments)
         mph.write_recipe(recipe, path)
         print(path)
         return
@@ -143,19 +147,19 @@ def _run(arguments: argparse.Namespace) -> None:
         raise mph.InputError("nothing to write: give --output FILE, or --write-recipe FILE")
     path = output_path(arguments.output, FORMATS)
     picture = output_path(arguments.mosaic) if arguments.mosaic else None
-    recipe, kept = _chosen(arguments)
-    count = len(frames_of(recipe))
-    outputs = {numbered_path(path, number, count).resolve() for number in range(1, count + 1)}
-    several = (recipe[key] or () for key in ("volume.states", "counts.files", "attenuation.file"))
-    for file in (*itertools.chain(*several), recipe["volume.file"]):
+    recipe, data = _recipe_and_data(arguments)
+    n_runs = len(frames_of(recipe))
+    outputs = {numbered_path(path, number, n_runs).resolve() for number in range(1, n_runs + 1)}
+    file_lists = (recipe[key] or () for key in ("volume.states", "counts.files", "attenuation.file"))
+    for file in (*itertools.chain(*file_lists), recipe["volume.file"]):
         if file is not None and Path(file).resolve() in outputs:
-            wrong = "the projections would replace what they are made from"
-            raise mph.InputError(f"{file}: {wrong}; choose another --output")
-    for number, run in enumerate(mph.run_recipe(recipe, **kept, stages=progress_bar), 1):
-        file = numbered_path(path, number, count)
+            problem = "the projections would replace what they are made from"
+            raise mph.InputError(f"{file}: {problem}; choose another --output")
+    for number, run in enumerate(mph.run_recipe(recipe, **data, stages=progress_bar), 1):
+        file = numbered_path(path, number, n_runs)
         mph.write_run(run, file)
         if picture is not None:
-            write_sheet(run, numbered_path(picture, number, count))
+            write_sheet(run, numbered_path(picture, number, n_runs))
         views, (n_v, n_u) = len(run.views), run.views.shape
         plural, largest = "s" * (views > 1), float(run.projections.max())
         print(f"{file}: {views} projection{plural} of {n_v} x {n_u} pixels, largest {largest:.4g} {run.unit}")

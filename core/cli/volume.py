@@ -1,4 +1,4 @@
-"""``mphdrr volume ACTION``: look at volumes, convert them, and turn them into meshes and back."""
+"""Command ``mphdrr volume ACTION``: facts about volumes, conversion, and meshes from and to volumes."""
 
 import argparse
 from typing import Any
@@ -12,16 +12,16 @@ from ..validation import positive, real_array, shape_text
 from ..volumes.meshes.mesh import MESH_FORMATS, MILLIMETRES
 from ..volumes.volume import UNITS
 from ..volumes.volume_files import VOLUME_FORMATS
-from .options import add_actions, add_run, described, one_or_three, output_path, print_answer, progress_bar
+from .options import add_actions, add_run, describe_volume, expand_to_three, output_path, print_answer, progress_bar
 
 _MESH_UNIT: dict[str, Any] = {
     "choices": tuple(MILLIMETRES),
-    "help": "of the mesh files' lengths; default: mm, of .glb m",
+    "help": "unit of length in the mesh files; default: mm, in .glb m",
 }
 
 
 def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
-    """Add the command."""
+    """Add the command ``mphdrr volume`` with its actions."""
     actions = add_actions(subparsers, "volume", "mphdrr volume info ct.nii.gz")
 
     info = add_run(actions, "info", _info)
@@ -32,18 +32,17 @@ def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
     _add_input(convert)
     steps = convert.add_argument_group("changes, in this order")
     add = steps.add_argument
-    add("--canonical", action="store_true", help="index axes to the right, front and head: flip, transpose")
+    add("--canonical", action="store_true", help="flip and transpose: index axes to the right, front and head")
     box = ("X0", "X1", "Y0", "Y1", "Z0", "Z1")
-    add("--crop", type=float, nargs=6, metavar=box, help="to a box, mm, in FILE's world")
-    add("--pad", type=int, default=0, metavar="N", help="voxels more on every side")
-    add("--center", action="store_true", help="move the middle to the isocentre")
+    add("--crop", type=float, nargs=6, metavar=box, help="crop to a box, mm, in FILE's world")
+    add("--pad", type=int, default=0, metavar="N", help="add N voxels on every side")
+    add("--center", action="store_true", help="move the centre to the isocentre")
     add("--spacing", type=float, nargs="+", metavar="MM", help="resample to this voxel size, one or three")
-    method = "of resampling; default: mean for coarser voxels, else linear; labels need nearest"
+    method = "interpolation; default: mean for larger voxels, else linear; labels need nearest"
     add("--method", choices=("linear", "nearest", "mean"), help=method)
-    text = "attenuation at KEV (or an isotope's line), such as that of a reconstructed CT, to CT numbers"
-    add("--from-mu", metavar="KEV", help=text)
+    add("--from-mu", metavar="KEV", help="attenuation at KEV, or an isotope's line, to CT numbers")
     add("--to-mu", action="store_true", help="CT numbers to attenuation, 1/mm, at --energy")
-    energy = "of the photons, or an isotope's name: its strongest line (default: 140.5)"
+    energy = "photon energy, or an isotope's name for its strongest line (default: 140.5)"
     convert.add_argument("--energy", metavar="KEV", help=energy)
     convert.add_argument("-o", "--output", required=True, metavar="FILE", help=", ".join(VOLUME_FORMATS))
 
@@ -51,46 +50,46 @@ def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
     add = from_mesh.add_argument
     add("mesh", nargs="+", metavar="MESH", help=f"{', '.join(MESH_FORMATS)}; later ones replace earlier ones")
     add("--unit", **_MESH_UNIT)
-    add("--value", type=float, nargs="+", default=[1.0], metavar="X", help="inside: one, or one per mesh")
-    add("--quantity", choices=tuple(UNITS), default="activity", help="what the values are")
+    add("--value", type=float, nargs="+", default=[1.0], metavar="X", help="value inside, one for all or one per mesh")
+    add("--quantity", choices=tuple(UNITS), default="activity", help="quantity of the values")
     add("--spacing", type=float, default=1.0, metavar="MM", help="voxel size")
-    voxels = "along x y z, around the isocentre; default: around the meshes"
+    voxels = "numbers of voxels along x y z, around the isocentre; default: around the meshes"
     add("--voxels", type=int, nargs=3, metavar="N", help=voxels)
     add("-o", "--output", required=True, metavar="FILE", help=", ".join(VOLUME_FORMATS))
 
     to_mesh = add_run(actions, "to-mesh", _to_mesh)
     _add_input(to_mesh)
-    level = "in the volume's unit; default: halfway to the largest value"
+    level = "value at the surface, in the volume's unit; default: halfway to the largest value"
     to_mesh.add_argument("--level", type=float, metavar="X", help=level)
     to_mesh.add_argument("--unit", **_MESH_UNIT)
     to_mesh.add_argument("-o", "--output", required=True, metavar="MESH", help=", ".join(MESH_FORMATS))
 
 
 def _add_input(parser: argparse.ArgumentParser) -> None:
-    """Add the volume to read, for `_input`."""
+    """Add the options that name the volume to read, for `_read_input`."""
     add = parser.add_argument
     add("file", metavar="FILE", help="volume, folder of a DICOM series, or any file of one (formats: docs/volumes.md)")
-    values = "what its values are; default: what the file says, else CT numbers, hu"
-    add("--quantity", choices=tuple(UNITS), help=values)
+    add("--quantity", choices=tuple(UNITS), help="quantity of its values; default: the file's, else CT numbers, hu")
     add("--series", metavar="NAME", help="one of several DICOM series, by number, description or UID")
-    affine = "index to world mm, row by row, instead of the file's; .npy needs it"
+    affine = "4 x 4 matrix from index to world mm, row by row, in place of the file's; .npy needs it"
     add("--affine", type=float, nargs=16, metavar="A", help=affine)
 
 
-def _input(arguments: argparse.Namespace) -> mph.Volume:
+def _read_input(arguments: argparse.Namespace) -> mph.Volume:
+    """Read the volume that the options of `_add_input` name."""
     affine = None if arguments.affine is None else np.reshape(arguments.affine, (4, 4))
-    more: dict[str, Any] = {"affine": affine, "series": arguments.series, "progress": progress_bar("reading")}
-    return mph.read_volume(arguments.file, arguments.quantity, **more)
+    options: dict[str, Any] = {"affine": affine, "series": arguments.series, "progress": progress_bar("reading")}
+    return mph.read_volume(arguments.file, arguments.quantity, **options)
 
 
 def _info(arguments: argparse.Namespace) -> None:
-    """Show a volume's place, grid and values.
+    """Show a volume's position, grid and values.
 
     mphdrr volume info ct.nii.gz
     """
     from nibabel.orientations import aff2axcodes
 
-    volume = _input(arguments)
+    volume = _read_input(arguments)
     array, grid = volume.array, volume.grid
     corners = grid.corners()
     facts = {
@@ -98,7 +97,7 @@ def _info(arguments: argparse.Namespace) -> None:
         "unit": volume.unit,
         "voxels": list(grid.shape),
         "spacing_mm": grid.spacing.tolist(),
-        "axes": "".join(aff2axcodes(grid.affine)),  # of R, L, A, P, S, I the closest
+        "axes": "".join(aff2axcodes(grid.affine)),  # the closest of R, L, A, P, S and I
         "center_mm": grid.center.tolist(),
         "low_mm": corners.min(axis=0).tolist(),
         "high_mm": corners.max(axis=0).tolist(),
@@ -114,7 +113,7 @@ def _info(arguments: argparse.Namespace) -> None:
 
 
 def _convert(arguments: argparse.Namespace) -> None:
-    """Convert a volume to another format, and crop, move, resample it or convert it to attenuation.
+    """Convert a volume to another format; crop, move or resample it, or convert it to attenuation.
 
     mphdrr volume convert dicom_folder --center --spacing 2 --to-mu --energy Tc-99m -o mu.nii.gz
     mphdrr volume convert mu70.nii.gz --from-mu 70 --to-mu --energy Tc-99m -o mu.nii.gz
@@ -125,7 +124,7 @@ def _convert(arguments: argparse.Namespace) -> None:
     if arguments.method is not None and not arguments.spacing:
         raise mph.InputError("--method needs --spacing")
     energy = photon_energy(arguments.energy or "140.5")
-    volume = _input(arguments)
+    volume = _read_input(arguments)
     if arguments.canonical:
         volume = mph.canonical(volume)
     if arguments.crop:
@@ -135,27 +134,27 @@ def _convert(arguments: argparse.Namespace) -> None:
     if arguments.center:
         volume = mph.centered(volume)
     if arguments.spacing:
-        volume = _respaced(volume, arguments.spacing, arguments.method)
+        volume = _resample_to_spacing(volume, arguments.spacing, arguments.method)
     if arguments.from_mu is not None:
         volume = mph.mu_to_hu(volume, photon_energy(arguments.from_mu))
     if arguments.to_mu:
         volume = mph.hu_to_mu(volume, energy)
     mph.write_volume(volume, path)
-    print(f"{path}: {described(volume)} {volume.unit}")
+    print(f"{path}: {describe_volume(volume)} {volume.unit}")
 
 
-def _respaced(volume: mph.Volume, spacing: list[float], method: str | None) -> mph.Volume:
-    """The volume on a grid with the same axes and first faces, and at least the same extent."""
+def _resample_to_spacing(volume: mph.Volume, spacing: list[float], method: str | None) -> mph.Volume:
+    """Return the volume on a grid of another voxel size, with the same axes and first faces, that covers the old one."""
     if len(spacing) not in (1, 3) or not min(spacing) > 0:
         got = " ".join(f"{x:g}" for x in spacing)
         raise mph.InputError(f"--spacing: expected one or three numbers above 0, got {got}")
     old = volume.grid
-    steps = one_or_three(spacing) / old.spacing  # in old voxels
+    steps = expand_to_three(spacing) / old.spacing  # in old voxels
     shape = np.maximum(1, np.ceil(old.shape / steps - 1e-6)).astype(int)
     index = np.diag([*steps, 1.0])
     index[:3, 3] = (steps - 1) / 2
     method = method or ("mean" if steps.max() > 1 else "linear")
-    # Label files say no quantity and are taken for CT numbers, but outside them is 0 and not air.
+    # A label file states no quantity and is taken for CT numbers, but outside it the value is 0 and not that of air.
     outside = 0.0 if method == "nearest" and volume.array.min() >= 0 else None
     return mph.resample(volume, mph.Grid(shape, old.affine @ index), method, outside, progress_bar("resampling"))
 
@@ -180,11 +179,11 @@ def _from_mesh(arguments: argparse.Namespace) -> None:
 
 
 def _to_mesh(arguments: argparse.Namespace) -> None:
-    """Make a closed mesh of the surface at a level, to show or to print.
+    """Make a closed mesh of the surface at a value of the volume, to show or to print.
 
     mphdrr volume to-mesh ct.nii.gz --level 300 -o bones.stl
     """
     path = output_path(arguments.output, MESH_FORMATS)
-    mesh = mph.volume_to_mesh(_input(arguments), arguments.level, progress_bar("surface"))
+    mesh = mph.volume_to_mesh(_read_input(arguments), arguments.level, progress_bar("surface"))
     mph.write_mesh(mesh, path, arguments.unit)
     print(f"{path}: {len(mesh.faces)} triangles around {mesh.volume * 1e-3:.4g} mL")

@@ -1,4 +1,4 @@
-"""Calibration: where the modules of a scanner are, from images of point sources."""
+"""Calibration of a scanner: the positions and tilts of its modules from images of point sources."""
 
 import math
 from collections.abc import Collection
@@ -10,71 +10,76 @@ from ..arrays import ArrayLike, Bools, Floats, Indexes
 from ..errors import InputError, several
 from ..geometry.system import PinholeSystem
 from ..geometry.views import Views
+from ..models.emission import Emission
+from ..models.model import with_image_axes
 from ..progress import Progress, stages_of
-from ..projector.emission import Emission
-from ..projector.models import each_pixel
 from ..runs.display import DIVERGING, Display
 from ..runs.mosaic import Sheet, sheet
 from ..validation import instance, one_of, positive, real_array, shape_text
-from .bundle import LENGTH, OFFSET, Bundle, Moved
-from .point_images import Lattice
+from .bundle import LENGTH, OFFSET, BundleAdjustment, FittedGeometry
+from .point_images import PixelLattice
 from .solvers import scipy_module
 from .spots import Spots, find_spots
 
 FITTED = (LENGTH, OFFSET)
-"""What can be fitted besides places and tilts. A detector's roll is the module's tilt about k, as the hole is round."""
-_NAMES = ("position u", "position v", "position k", "tilt u", "tilt v", "tilt k")
-_FEWEST = 3  # points: a module has six numbers, and each point tells two
-_UNLIKE = 5.0  # standard deviations that an image is less like a disc's than by chance
-_OUTLYING = 6.0  # standard deviations from where the geometry has a spot
-_FAR = 5.0  # standard deviations of what was thought of a module's numbers
+"""Parameters that can be fitted besides positions and tilts.
+
+A detector's roll is the module's tilt about k, because the hole is round.
+"""
+_PARAMETERS = ("position u", "position v", "position k", "tilt u", "tilt v", "tilt k")
+_MIN_POINTS = 3  # a module has six parameters, and each point gives two equations
+_DISC_MISFIT = 5.0  # standard deviations by which an image may differ from a disc's more than by chance
+_OUTLIER = 6.0  # standard deviations of an outlier from its fitted position
+_MAX_PRIOR = 5.0  # prior standard deviations by which a module's parameters may differ from the nominal ones
 _ROUNDS = 20
-_CHANCE = 1e-3  # that any module of a right model is said not to fit
-_STAYS = 1e-6  # mm, degrees: rounding
-_TOLD = 0.75  # of a number's variance that images must take away
-_MOST = 5.0  # standard deviations at the ends of the colours of residuals
+_FALSE_ALARM = 1e-3  # probability that any module of a correct model is reported as misfitting
+_UNMOVED = 1e-6  # mm and degrees; smaller changes are rounding
+_DETERMINED = 0.75  # share of a parameter's prior variance that images must remove to determine it
+_COLOR_RANGE = 5.0  # standard deviations at both ends of the colours of residuals
 
 
 @dataclass(frozen=True, eq=False)
 class Calibration:
-    """A scanner as images of point sources have it, by `calibrate`.
+    """Result of `calibrate`: the scanner's geometry as determined by images of point sources.
 
     Attributes
     ----------
     system : PinholeSystem
-        The modules at their places with their tilts, and with their lengths if these were fitted.
+        System with the calibrated positions and tilts, and with the calibrated lengths if these were fitted.
     nominal : PinholeSystem
-        The geometry that was given.
+        System with the nominal geometry.
     views : Views
-        Theirs: the given ones moved with the modules, and their pixels by the detectors' offset.
+        Nominal views, moved with the modules, and with their pixels shifted by the detector offset.
     points : array (K, 3)
-        The sources, world mm.
+        Positions of the sources, world mm.
     covariance : array (M, 6, 6)
-        Of each module: of the pinhole's position along the module's own u, v and k, mm, then of the tilt's rotation vector
+        Covariance of each module's pinhole position along its own u, v and k, mm, and of its tilt's rotation vector
         (``system.tilt``), rad.
     chi_square : array (M,)
-        Pearson's, per degree of freedom, of the pixels around the spots, with the spots where the geometry has them: about 1
-        if the model is right. NaN where nothing was seen.
+        Pearson's chi-square per degree of freedom of the pixels around the spots, for spots at the positions of the fitted
+        geometry: about 1 if the model is right; NaN for a module without a spot.
     misfit : array (M,)
-        Squared distances of spots from where the geometry has them, in units of their variance, per degree of freedom.
+        Mean squared distance of the spots from their positions in the fitted geometry, in units of their variance, per
+        degree of freedom.
     misfitting : tuple of int
-        Numbers of the modules that do not fit. Their outlying images were left out; those of a module that they would put
-        farther than 5 standard deviations from its nominal place, all, and it has stayed there.
+        Numbers of the modules that do not fit. Their outliers were not used. A module that its images would move by more
+        than 5 prior standard deviations keeps its nominal parameters, and none of its images was used.
     used : array (K, M)
-        The images that were used.
+        Mask of the images that the fit used.
     names : tuple of str
-        The P numbers that were fitted for each module.
+        Names of the P parameters that were fitted for each module.
     spread : array (M, P)
-        Their standard deviations, mm and rad.
+        Standard deviations of the fitted parameters, mm and rad.
     told : array (M, P)
-        Share of each number's variance, as it was thought before, that the images take away: one with 0 has stayed nominal.
+        Share of each parameter's prior variance that the images removed; a parameter with 0 has kept its nominal value.
     gauge : tuple of str
-        What images cannot tell of the scanner as a whole: "shift", "turn" and, of unknown scale, "scale": 7 numbers, or 6,
-        or none with known points. By these the pinholes are on average where they nominally are.
+        Changes of the scanner as a whole that the images cannot determine: "shift", "turn" and, if the scale is unknown,
+        "scale", together 7 numbers, or 6, or none with known points. In these, the pinholes agree with the nominal ones on
+        average.
     detector_offset : array (M, 2)
-        How far pixels lie from where the given views have them, mm along u and v on the crystal.
+        Shift of the pixels on the crystal from those of the nominal views, mm along u and v.
     residuals : array (M, n_v, n_u)
-        Of each module's spots together, the counts around them less those expected, in standard deviations.
+        Counts around each module's spots, summed over its spots, minus expected counts, in standard deviations.
     """
 
     system: PinholeSystem
@@ -94,34 +99,34 @@ class Calibration:
     residuals: Floats
 
     def untold(self) -> list[str]:
-        """What the images hardly tell, and so has stayed about nominal: lines such as "modules 3, 17: length"."""
-        weak: dict[str, list[str]] = {}
+        """Return lines with the parameters that the images hardly determine, such as "modules 3, 17: length"."""
+        names_by_modules: dict[str, list[str]] = {}
         for name, told in zip(self.names, self.told.T, strict=True):
-            numbers = self.system.numbers[told < _TOLD].tolist()
-            if numbers:
-                some = f"module{'s' * (len(numbers) > 1)} {several(numbers, 12)}"
-                weak.setdefault("all modules" if len(numbers) == len(told) else some, []).append(name)
-        return [f"{which}: {', '.join(names)}" for which, names in weak.items()]
+            if numbers := self.system.numbers[told < _DETERMINED].tolist():
+                modules = f"module{'s' * (len(numbers) > 1)} {several(numbers, 12)}"
+                modules = "all modules" if len(numbers) == len(told) else modules
+                names_by_modules.setdefault(modules, []).append(name)
+        return [f"{modules}: {', '.join(names)}" for modules, names in names_by_modules.items()]
 
     def residual_sheet(self) -> Sheet:
-        """The residuals of all modules, drawn ring by ring: noise without a pattern where the geometry fits."""
-        display = Display(colors=DIVERGING, low=-_MOST, high=_MOST)
+        """Draw the residuals of all modules, ring by ring: noise without a pattern where the geometry fits."""
+        display = Display(colors=DIVERGING, low=-_COLOR_RANGE, high=_COLOR_RANGE)
         residuals = self.residuals.astype(np.float32)
         return sheet(residuals, self.system.numbers, self.system.rings(), "standard deviations", display)
 
     def summary(self) -> list[str]:
-        """How far modules are from their nominal places and tilts, what does not fit and what is not told, in lines."""
+        """Return lines with the modules' changes, those that do not fit, and the parameters that are not determined."""
         shifts = np.linalg.norm(self.system.centers - self.nominal.centers, axis=1)
-        turns = np.degrees(np.linalg.norm(self.system.tilt - self.nominal.tilt, axis=1))
-        moved, worst = int(((shifts > _STAYS) | (turns > _STAYS)).sum()), int(np.argmax(shifts))
-        mm, degrees = (np.sqrt((each**2).sum() / max(1, moved)) for each in (shifts, turns))
-        odd, whole = several(self.misfitting, 12), ", ".join(self.gauge)
+        tilts = np.degrees(np.linalg.norm(self.system.tilt - self.nominal.tilt, axis=1))
+        n_moved, far = int(((shifts > _UNMOVED) | (tilts > _UNMOVED)).sum()), int(np.argmax(shifts))
+        mm, degrees = (np.sqrt((changes**2).sum() / max(1, n_moved)) for changes in (shifts, tilts))
+        misfitting, gauge = several(self.misfitting, 12), ", ".join(self.gauge)
         return [
-            f"{moved} of {len(shifts)} modules moved, RMS {mm:.2f} mm and {degrees:.2f} degrees",
-            f"farthest: module {self.system.numbers[worst]}, {shifts[worst]:.2f} mm and {turns[worst]:.2f} degrees",
-            f"modules that do not fit: {odd}" if odd else "all modules fit",
-            *([f"{whole} of the scanner as a whole: nominal, these images do not tell them"] if whole else []),
-            *(f"not told, {line}" for line in self.untold()),
+            f"{n_moved} of {len(shifts)} modules moved, RMS {mm:.2f} mm and {degrees:.2f} degrees",
+            f"farthest: module {self.system.numbers[far]}, {shifts[far]:.2f} mm and {tilts[far]:.2f} degrees",
+            f"modules that do not fit: {misfitting}" if misfitting else "all modules fit",
+            *([f"{gauge} of the scanner as a whole: nominal, these images do not determine them"] if gauge else []),
+            *(f"not determined: {line}" for line in self.untold()),
         ]
 
 
@@ -141,43 +146,44 @@ def calibrate(
     distance_sd: float = 0.02,
     progress: Progress | None = None,
 ) -> Calibration:
-    """Find where a scanner's modules are from images of point sources, one source in each of K acquisitions.
+    """Determine the positions and tilts of a scanner's modules from images of point sources, one source per acquisition.
 
-    In each image the spot's middle is that of the largest Poisson likelihood of the whole hole's shadow, in closed form; its
-    counts, its radius and an even background are free, so neither activities nor diameters of holes need be known. Modules
-    and points are those of the least squares of all middles (SciPy). Images that do not fit are left out, and their modules
-    named.
+    In each of K acquisitions, the centre of each module's spot is found by maximum likelihood (Poisson), with the shadow of
+    the hole in closed form. The spot's counts and radius and a uniform background are free, so that neither activities nor
+    hole diameters need be known. Modules and points are the least-squares solution for all centres (SciPy). Images that do
+    not fit are not used, and their modules are reported.
 
     Parameters
     ----------
     system
-        The nominal geometry.
+        Nominal geometry.
     images
-        (K, M, n_v, n_u): measured counts of each acquisition.
+        Measured counts (K, M, n_v, n_u) of each acquisition.
     views
-        The nominal views of the images.
+        Nominal views of the images.
     points
-        (K, 3): where the sources are, world mm. None: they are found, too.
+        Positions (K, 3) of the sources, world mm. None: they are determined, too.
     distances
-        (K, K): those between sources that are known, mm, NaN elsewhere; they give the scale. None: it stays nominal.
+        Known distances (K, K) between sources, mm, NaN for unknown ones; they determine the scale. None: the scale stays
+        nominal.
     model
-        The physics: holes, the crystal's blur, background. None: a crystal without blur, whose sharp shadows make the
-        covariances too small for one with it.
+        Emission model with the holes, the crystal's blur and the background. None: a crystal without blur, whose sharp
+        shadows make the covariances too small for a crystal with blur.
     fit
-        What is fitted besides places and tilts, of "collimator_length" and "detector_offset".
+        Parameters that are fitted besides positions and tilts, of "collimator_length" and "detector_offset".
     position_sd, tilt_sd_degrees, collimator_length_sd, detector_offset_sd
-        How far modules may be from the nominal geometry along each axis: standard deviations, mm and degrees. They are weak
-        beside what images tell; what these do not tell stays nominal.
+        Prior standard deviations of the modules from the nominal geometry along each axis, mm and degrees. These priors are
+        weak compared with images; a parameter that no image determines stays nominal.
     distance_sd
-        How well the distances are known, mm.
+        Standard deviation of the known distances, mm.
     progress
-        Counts acquisitions.
+        Called with (done, total) acquisitions.
 
     Raises
     ------
     InputError
         There are too few points, an acquisition shows none, images and views are not of the system, most modules are farther
-        away than allowed, or SciPy is missing.
+        from the nominal geometry than allowed, or SciPy is missing.
     """
     instance(system, PinholeSystem, "calibrate: system")
     instance(views, Views, "calibrate: views")
@@ -187,53 +193,55 @@ def calibrate(
     n_k = len(images)
     if images.min(initial=0.0) < 0:
         raise InputError(f"calibrate: images: expected counts, 0 or more, got {images.min():g}")
-    if n_k < _FEWEST:
-        raise InputError(f"calibrate: images: expected {_FEWEST} acquisitions or more, each of a point, got {n_k}")
+    if n_k < _MIN_POINTS:
+        raise InputError(f"calibrate: images: expected {_MIN_POINTS} acquisitions or more, each of a point, got {n_k}")
     for name in fit:
         one_of(name, FITTED, "calibrate: fit")
-    own = {LENGTH: [collimator_length_sd], OFFSET: [detector_offset_sd] * 2}
-    fitted = tuple(name for name in FITTED if name in fit)
-    sd = [position_sd] * 3 + [math.radians(tilt_sd_degrees)] * 3 + [each for name in fitted for each in own[name]]
-    sds = np.array([positive(each, "calibrate: standard deviations") for each in sd])
+    further_sd = {LENGTH: [collimator_length_sd], OFFSET: [detector_offset_sd] * 2}
+    further = tuple(name for name in FITTED if name in fit)
+    sd = [position_sd] * 3 + [math.radians(tilt_sd_degrees)] * 3 + [x for name in further for x in further_sd[name]]
+    prior_sd = np.array([positive(x, "calibrate: standard deviations") for x in sd])
     pairs, lengths = _known_distances(distances, n_k)
     if points is not None and len(pairs):
         raise InputError("calibrate: give points or distances, not both")
-    lattice = Lattice.of(model, views)
+    lattice = PixelLattice.from_views(model, views)
     radii = model.effective_diameter / 2 * (1 + system.collimator_length / system.pinhole_distance)
     stages = stages_of(progress)
-    spots = find_spots(images, each_pixel(model.background), lattice, radii, stages("finding spots"))
+    spots = find_spots(images, with_image_axes(model.background), lattice, radii, stages("finding spots"))
     stages("finding modules")
     _require_spots(spots.seen, 2 if points is None else 1)
-    places = lattice.first + lattice.step * spots.pixels
+    positions = lattice.first + lattice.step * spots.pixels
     covariance = spots.covariance * lattice.step[:, :, None] * lattice.step[:, None, :]
     pearson, freedom = spots.pearson(lattice)
-    unlike = pearson / np.maximum(freedom, 1)  # a disc's image: then the middle is known less well
-    covariance *= np.where(unlike > 1 + _UNLIKE * np.sqrt(2 / np.maximum(freedom, 1)), unlike, 1.0)[..., None, None]
-    covariance[~spots.seen], places[~spots.seen] = np.eye(2), 0.0
+    # The centre of a spot that is not like a disc is less certain.
+    ratio, limit = pearson / np.maximum(freedom, 1), 1 + _DISC_MISFIT * np.sqrt(2 / np.maximum(freedom, 1))
+    covariance *= np.where(ratio > limit, ratio, 1.0)[..., None, None]
+    covariance[~spots.seen], positions[~spots.seen] = np.eye(2), 0.0
     whitening = np.linalg.inv(np.linalg.cholesky(covariance))
-    start = _triangulated(system, places, spots.seen) if points is None else points
+    start = _triangulate_points(system, positions, spots.seen) if points is None else points
     start = real_array(start, "calibrate: points", (n_k, 3))
-    of_places = places, whitening, spots.seen, pairs, lengths, positive(distance_sd, "calibrate: distance_sd", "mm")
-    bundle, x = _without_outliers(Bundle(system, start, points is None, fitted, sds, *of_places))
-    return _result(views, bundle, x, spots, lattice)
+    measured = positions, whitening, spots.seen, pairs, lengths, positive(distance_sd, "calibrate: distance_sd", "mm")
+    bundle, x = _fit_without_outliers(BundleAdjustment(system, start, points is None, further, prior_sd, *measured))
+    return _make_result(views, bundle, x, spots, lattice)
 
 
 def _check_model(model: Emission, system: PinholeSystem, views: Views) -> None:
+    """Raise `InputError` unless the model is that of the system and of a hole's shadow on the crystal's front."""
     instance(model, Emission, "calibrate: model")
     if len(model.system) != len(system) or not np.allclose(model.system.poses(), system.poses()):
         raise InputError("calibrate: model: expected that of the system, Emission(system, ...)")
     model.check(views)
-    uneven = np.ndim(model.efficiency) == 3 or not np.all(model.efficiency)
-    others = {"edge 'path'": model.edge == "path", "depth_layers": model.depth_layers > 1}
-    others |= {"wall_thickness": model.wall_thickness is not None}
-    others |= {"lines apart": model.is_apart, "efficiency of single pixels, or of 0": uneven}
-    for name, is_other in others.items():
-        if is_other:
+    is_uneven = np.ndim(model.efficiency) == 3 or not np.all(model.efficiency)
+    refused = {"edge 'path'": model.edge == "path", "depth_layers": model.depth_layers > 1}
+    refused |= {"wall_thickness": model.wall_thickness is not None}
+    refused |= {"lines apart": model.is_apart, "efficiency of single pixels, or of 0": is_uneven}
+    for name, is_refused in refused.items():
+        if is_refused:
             raise InputError(f"calibrate: model: takes no {name}: a spot is a hole's shadow on the crystal's front")
 
 
 def _known_distances(distances: ArrayLike | None, n_k: int) -> tuple[Indexes, Floats]:
-    """Pairs (D, 2) of points whose distances (D,), mm, are known."""
+    """Return the pairs (D, 2) of points with a known distance, and these distances (D,), mm, of a table (K, K)."""
     table = np.full((n_k, n_k), np.nan) if distances is None else np.array(distances, np.float64)
     if table.shape != (n_k, n_k):
         raise InputError(f"calibrate: distances: expected shape {n_k} x {n_k}, got {shape_text(table.shape)}")
@@ -246,97 +254,107 @@ def _known_distances(distances: ArrayLike | None, n_k: int) -> tuple[Indexes, Fl
     return pairs, lengths
 
 
-def _require_spots(seen: Bools, modules: int) -> None:
-    for k in np.flatnonzero(seen.sum(axis=1) < modules)[:1]:
-        found = f"acquisition {k + 1}: {seen[k].sum()} modules see a point source"
-        raise InputError(f"calibrate: images: {found}, expected {modules} or more")
-    if seen.sum(axis=0).max() < _FEWEST:
-        found = f"no module sees {_FEWEST} points"
-        raise InputError(f"calibrate: images: {found}; expected more of them in its field of view")
+def _require_spots(seen: Bools, n_modules: int) -> None:
+    """Raise `InputError` unless `n_modules` modules see each point and some module sees enough points; `seen` is (K, M)."""
+    for k in np.flatnonzero(seen.sum(axis=1) < n_modules)[:1]:
+        fault = f"acquisition {k + 1}: {seen[k].sum()} modules see a point source"
+        raise InputError(f"calibrate: images: {fault}, expected {n_modules} or more")
+    if seen.sum(axis=0).max() < _MIN_POINTS:
+        fault = f"no module sees {_MIN_POINTS} points"
+        raise InputError(f"calibrate: images: {fault}; expected more of them in its field of view")
 
 
-def _triangulated(system: PinholeSystem, places: Floats, seen: Bools) -> Floats:
-    """Points (K, 3) nearest to the nominal rays; those far from the others count little."""
-    local = np.concatenate([places, np.broadcast_to(system.collimator_length[:, None], (*seen.shape, 1))], axis=2)
+def _triangulate_points(system: PinholeSystem, positions: Floats, seen: Bools) -> Floats:
+    """Return the points (K, 3), world mm, closest to the nominal rays of their spots; outlying rays have little weight.
+
+    `positions` (K, M, 2) are the spots on the crystals, mm; `seen` (K, M) tells which exist.
+    """
+    local = np.concatenate([positions, np.broadcast_to(system.collimator_length[:, None], (*seen.shape, 1))], axis=2)
     rays = np.einsum("mij,kmi->kmj", system.frames(), local / np.linalg.norm(local, axis=2, keepdims=True))
-    across = np.eye(3) - rays[..., None] * rays[..., None, :]
+    projections = np.eye(3) - rays[..., None] * rays[..., None, :]  # perpendicular to the rays
     weights = seen.astype(np.float64)
     for _ in range(10):
-        weighted = weights[..., None, None] * across
+        weighted = weights[..., None, None] * projections
         right = np.einsum("kmij,mj->ki", weighted, system.centers)
         points = np.linalg.solve(weighted.sum(axis=1) + 1e-9 * np.eye(3), right[..., None])[..., 0]
-        off = np.einsum("kmij,kmj->kmi", across, points[:, None] - system.centers)
-        weights = seen / (1 + np.linalg.norm(off, axis=2))
+        distances = np.einsum("kmij,kmj->kmi", projections, points[:, None] - system.centers)
+        weights = seen / (1 + np.linalg.norm(distances, axis=2))
     return points
 
 
-def _without_outliers(bundle: Bundle) -> tuple[Bundle, Floats]:
-    """The bundle without the images that do not fit, and its solution."""
+def _fit_without_outliers(bundle: BundleAdjustment) -> tuple[BundleAdjustment, Floats]:
+    """Solve the adjustment repeatedly, each time without further outliers; return it without them, and its solution x."""
     x, robust = bundle.start(), True
     for _ in range(_ROUNDS):
-        x, used = bundle.solved(x, robust), bundle.used
-        off = used * bundle.off(x)
-        usual = max(1.0, float(np.median(off[used])) / math.sqrt(2 * math.log(2)))  # the median of two normal numbers
-        # They would be another module's images, or upside down.
-        bad = used & (np.abs(bundle.of_modules(x)) > _FAR).any(axis=1)
-        if not bad.any():  # the worst only: they draw others away
-            bad = off > max(_OUTLYING * usual, float(off.max()) / 2)
-            bad |= used & bad.any(axis=0) & ((used & ~bad).sum(axis=0) <= _FEWEST)  # which anything fits
-        if not bad.any() and not robust:
+        x, used = bundle.solve(x, robust), bundle.used
+        deviations = used * bundle.spot_deviations(x)
+        # The median distance of two normal numbers from 0 is sqrt(2 ln 2).
+        typical = max(1.0, float(np.median(deviations[used])) / math.sqrt(2 * math.log(2)))
+        # All images of a module far from its nominal parameters: they are another module's, or upside down.
+        outliers = used & (np.abs(bundle.module_parameters(x)) > _MAX_PRIOR).any(axis=1)
+        if not outliers.any():  # otherwise only the worst spots, because they draw others away
+            outliers = deviations > max(_OUTLIER * typical, float(deviations.max()) / 2)
+            # With few spots left, any parameters of the module would fit.
+            outliers |= used & outliers.any(axis=0) & ((used & ~outliers).sum(axis=0) <= _MIN_POINTS)
+        if not outliers.any() and not robust:
             break
-        robust = bool(bad.any())
-        bundle = replace(bundle, used=used & ~bad)
+        robust = bool(outliers.any())
+        bundle = replace(bundle, used=used & ~outliers)
         if bundle.used.any(axis=0).sum() < len(bundle.system) / 2:
             raise InputError(
                 "calibrate: most modules would be farther than 5 standard deviations from the nominal geometry; expected "
                 "points in the scanner's frame (or their distances instead), or larger position_sd and tilt_sd_degrees"
             )
-        bundle.of_modules(x)[bad.any(axis=0)] = 0.0
+        bundle.module_parameters(x)[outliers.any(axis=0)] = 0.0
     return bundle, x
 
 
-def _result(views: Views, bundle: Bundle, x: Floats, spots: Spots, lattice: Lattice) -> Calibration:
-    nominal, now, seen, used = bundle.system, bundle.moved(x), spots.seen, bundle.used
+def _make_result(views: Views, bundle: BundleAdjustment, x: Floats, spots: Spots, lattice: PixelLattice) -> Calibration:
+    """Return the result of an adjustment with the solution x: geometry, uncertainties and tests of the fit."""
+    nominal, fitted, seen, used = bundle.system, bundle.geometry(x), spots.seen, bundle.used
     covariance, leverages = bundle.covariance(x)
     told = np.clip(1 - np.diagonal(covariance, axis1=1, axis2=2), 0, 1)
     units = np.broadcast_to(np.eye(len(bundle.sd)) * bundle.sd, covariance.shape).copy()
-    # Shifts along the module's own axes.
-    units[:, :3, :3] = now.frames @ nominal.frames().swapaxes(1, 2) * bundle.sd[:3]
+    # Shifts along the axes of the fitted module instead of the nominal one.
+    units[:, :3, :3] = fitted.frames @ nominal.frames().swapaxes(1, 2) * bundle.sd[:3]
     covariance = units @ covariance @ units.swapaxes(1, 2)
-    off, (pearson, freedom) = bundle.off(x) ** 2, spots.pearson(lattice)
-    of_middles, of_pixels = (2 * used - leverages).sum(axis=0), (seen * (freedom + 2) - leverages).sum(axis=0)
-    sums = ((used * off).sum(axis=0), of_middles), ((seen * (pearson + off)).sum(axis=0), of_pixels)
-    misfit, chi_square = (np.where(of > 0.5, total / np.maximum(of, 0.5), np.nan) for total, of in sums)
-    odd = (seen & ~used).any(axis=0) | _improbable(misfit, of_middles) | _improbable(chi_square, of_pixels)
-    expected = spots.expected(lattice, (now.seen() - lattice.first) / lattice.step)
-    over, total = ((seen[..., None, None] * each).sum(axis=0) for each in (spots.windows - expected, expected))
-    extras = {LENGTH: ("length",), OFFSET: ("offset u", "offset v")}
-    names = (*_NAMES, *(name for kind in bundle.fit for name in extras[kind]))
+    squared, (pearson, freedom) = bundle.spot_deviations(x) ** 2, spots.pearson(lattice)
+    spot_freedom, pixel_freedom = (2 * used - leverages).sum(axis=0), (seen * (freedom + 2) - leverages).sum(axis=0)
+    sums = ((used * squared).sum(axis=0), spot_freedom), ((seen * (pearson + squared)).sum(axis=0), pixel_freedom)
+    misfit, chi_square = (np.where(n > 0.5, total / np.maximum(n, 0.5), np.nan) for total, n in sums)
+    misfits = (
+        (seen & ~used).any(axis=0) | _is_improbable(misfit, spot_freedom) | _is_improbable(chi_square, pixel_freedom)
+    )
+    expected = spots.expected(lattice, (fitted.project_points() - lattice.first) / lattice.step)
+    excess, total = ((seen[..., None, None] * w).sum(axis=0) for w in (spots.windows - expected, expected))
+    further_names = {LENGTH: ("length",), OFFSET: ("offset u", "offset v")}
+    names = (*_PARAMETERS, *(name for kind in bundle.fit for name in further_names[kind]))
     gauge = ("shift", "turn", "scale")[: len(bundle.gauge()) // 3 + len(bundle.gauge()) % 3]
+    system = nominal.replace(centers=fitted.centers, tilt=fitted.tilt, collimator_length=fitted.length)
     return Calibration(
-        nominal.replace(centers=now.centers, tilt=now.tilt, collimator_length=now.length), nominal,
-        _moved_views(views, nominal, now), now.points, covariance[:, :6, :6], chi_square, misfit,
-        tuple(nominal.numbers[odd].tolist()), used, names,
-        np.sqrt(np.diagonal(covariance, axis1=1, axis2=2)), told, gauge, now.offset, over / np.sqrt(np.maximum(total, 1)),
+        system, nominal, _move_views(views, nominal, fitted), fitted.points, covariance[:, :6, :6], chi_square, misfit,
+        tuple(nominal.numbers[misfits].tolist()), used, names, np.sqrt(np.diagonal(covariance, axis1=1, axis2=2)), told,
+        gauge, fitted.offset, excess / np.sqrt(np.maximum(total, 1)),
     )  # fmt: skip
 
 
-def _improbable(per_freedom: Floats, freedom: Floats) -> Bools:
-    """Which modules' sums of squares are too large, beside those of the others, to be chance."""
-    usual = max(1.0, float(np.nanmedian(per_freedom))) if np.isfinite(per_freedom).any() else 1.0
-    values = np.nan_to_num(per_freedom) / usual
-    chance = scipy_module("special").chdtrc(np.maximum(freedom, 0.5), values * freedom)
-    return np.asarray(chance < _CHANCE / len(freedom))
+def _is_improbable(per_freedom: Floats, freedom: Floats) -> Bools:
+    """Return whether each module's chi-square is too large, relative to the other modules', to be chance, (M,).
+
+    `per_freedom` (M,) is chi-square per degree of freedom, `freedom` (M,) the degrees of freedom.
+    """
+    typical = max(1.0, float(np.nanmedian(per_freedom))) if np.isfinite(per_freedom).any() else 1.0
+    scaled = np.nan_to_num(per_freedom) / typical
+    p_value = scipy_module("special").chdtrc(np.maximum(freedom, 0.5), scaled * freedom)
+    return np.asarray(p_value < _FALSE_ALARM / len(freedom))
 
 
-def _moved_views(views: Views, nominal: PinholeSystem, now: Moved) -> Views:
-    """The views, moved with the modules; pixels keep their places on the crystals but for the detectors' offsets."""
-    frames, back = nominal.frames(), now.frames.swapaxes(1, 2)
-    middle, u_steps, v_steps = (
-        np.einsum("mij,mj->mi", frames, each)
-        for each in (views.detector_centers - views.sources, views.u_steps, views.v_steps)
-    )
-    middle[:, :2] -= (middle[:, 2] / nominal.collimator_length)[:, None] * now.offset
-    middle[:, 2] *= now.length / nominal.collimator_length
-    middle, u_steps, v_steps = (np.einsum("mij,mj->mi", back, each) for each in (middle, u_steps, v_steps))
-    return Views(now.centers, now.centers + middle, u_steps, v_steps, views.shape)
+def _move_views(views: Views, nominal: PinholeSystem, fitted: FittedGeometry) -> Views:
+    """Return the views moved with the modules; their pixels stay on the crystals, except for the detector offsets."""
+    frames, world_from_module = nominal.frames(), fitted.frames.swapaxes(1, 2)
+    vectors = views.detector_centers - views.sources, views.u_steps, views.v_steps
+    center, u_steps, v_steps = (np.einsum("mij,mj->mi", frames, vector) for vector in vectors)
+    center[:, :2] -= (center[:, 2] / nominal.collimator_length)[:, None] * fitted.offset
+    center[:, 2] *= fitted.length / nominal.collimator_length
+    center, u_steps, v_steps = (np.einsum("mij,mj->mi", world_from_module, x) for x in (center, u_steps, v_steps))
+    return Views(fitted.centers, fitted.centers + center, u_steps, v_steps, views.shape)

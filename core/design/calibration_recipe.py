@@ -1,4 +1,4 @@
-"""Recipes of calibrations (TOML): the runs of which sources, what is fitted, what is thought beforehand."""
+"""Recipes of calibrations, in TOML: the runs, known sources, fitted parameters and prior standard deviations."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -10,8 +10,8 @@ from ..errors import InputError, naming
 from ..events.entries import by_key, flat, required, table
 from ..files import AnyPath
 from ..geometry.system import PinholeSystem
+from ..models.emission import Emission
 from ..progress import Progress
-from ..projector.emission import Emission
 from ..runs.files import read_run
 from ..runs.recipe import Values
 from ..runs.run_recipe import recipe_model
@@ -27,30 +27,35 @@ _ROWS = by_key((
     Setting("runs.files", str, None, "Run files of counts, one of each acquisition", is_path=True, sizes=()),
     Setting("system.file", str, None, "Workbook of the runs' scanner, of which a calibrated copy is written", "a new one",
             is_path=True),
-    Setting(f"fit.{LENGTH}", bool, False, "Also find the collimators' lengths"),
-    Setting(f"fit.{OFFSET}", bool, False, "Also find where the pixels lie on the crystals"),
-    Setting("priors.position_sd", float, 5.0, _SD + "the pinholes from their nominal places", unit="mm", above=0),
+    Setting(f"fit.{LENGTH}", bool, False, "Also fit the collimator lengths"),
+    Setting(f"fit.{OFFSET}", bool, False, "Also fit the pixels' offsets on the crystals"),
+    Setting("priors.position_sd", float, 5.0, _SD + "the pinholes from their nominal positions", unit="mm", above=0),
     Setting("priors.tilt_sd_degrees", float, 2.0, _SD + "the modules' tilts from the nominal ones", above=0),
-    Setting(f"priors.{LENGTH}_sd", float, 1.0, _SD + "the lengths", unit="mm", above=0),
-    Setting(f"priors.{OFFSET}_sd", float, 0.5, _SD + "the pixels' places", unit="mm", above=0),
+    Setting(f"priors.{LENGTH}_sd", float, 1.0, _SD + "the lengths from the nominal ones", unit="mm", above=0),
+    Setting(f"priors.{OFFSET}_sd", float, 0.5, _SD + "the pixels from their nominal positions", unit="mm", above=0),
     Setting("priors.distance_sd", float, 0.02, _SD + "known distances between sources", unit="mm", above=0),
 ))  # fmt: skip
 _SOURCES = ("points", "distances")
 
 
-class _Values(Values):
+class _CalibrationSettings(Values):
+    """Settings of a calibration's recipe."""
+
     rows = _ROWS  # type: ignore[assignment]
 
 
 def run_calibration(path: AnyPath, progress: Progress | None = None) -> Calibration:
-    """The calibration that a recipe asks for; its paths are relative to its folder. `InputError` names file and entry."""
+    """Calibrate a scanner by the recipe in a TOML file; paths in it are relative to its folder.
+
+    `progress` is called with (done, total) acquisitions. `InputError` names the file and the entry.
+    """
     tables, folder = read_toml(path), Path(path).parent
     with naming(path):
         sources = table(tables, "sources")
         for name in sources.keys() - set(_SOURCES):
             raise InputError(f"sources.{name}: no such setting; expected {', '.join(_SOURCES)}")
         tables.pop("sources", None)
-        recipe = _Values(flat(tables, _ROWS, *(name for name in tables if isinstance(tables[name], dict))))
+        recipe = _CalibrationSettings(flat(tables, _ROWS, *(name for name in tables if isinstance(tables[name], dict))))
         files = required(recipe["runs.files"], "runs.files", "name a run file of each acquisition")
         runs = [read_run(folder / name) for name in files]
         workbook = recipe["system.file"]
@@ -59,25 +64,29 @@ def run_calibration(path: AnyPath, progress: Progress | None = None) -> Calibrat
         if not isinstance(system, PinholeSystem) or not isinstance(model, Emission):
             raise InputError("runs.files: expected runs of counts of pinholes")
         for name, run in zip(files, runs, strict=True):
-            if run.projections.shape != runs[0].projections.shape or not _same(run.system, system):
+            if run.projections.shape != runs[0].projections.shape or not _have_same_poses(run.system, system):
                 raise InputError(f"runs.files: {name}: expected the modules of {workbook or files[0]}")
         priors = {key.partition(".")[2]: recipe[key] for key in _ROWS if key.startswith("priors.")}
         return calibrate(
             system, np.stack([run.projections for run in runs]), runs[0].views, sources.get("points"),
-            _distances(sources.get("distances"), len(runs)), model=replace(model, background=runs[0].background),
+            _distance_table(sources.get("distances"), len(runs)), model=replace(model, background=runs[0].background),
             fit=[name for name in (LENGTH, OFFSET) if recipe[f"fit.{name}"]], **priors, progress=progress,
         )  # fmt: skip
 
 
-def _same(one: Any, other: Any) -> bool:
-    return len(one) == len(other) and np.allclose(one.poses(), other.poses(), atol=1e-6)
+def _have_same_poses(a: Any, b: Any) -> bool:
+    """Return whether two scanners have the same modules at the same poses."""
+    return len(a) == len(b) and np.allclose(a.poses(), b.poses(), atol=1e-6)
 
 
-def _distances(listed: Any, n_k: int) -> Any:
-    """The table of distances (K, K) of a list of [first, second, mm], sources counted from 1."""
-    if listed is None:
+def _distance_table(entries: Any, n_k: int) -> Any:
+    """Return the table of distances (K, K), mm, NaN for unknown ones, from a recipe's list of [first, second, mm].
+
+    Sources are numbered from 1. Returns None for None.
+    """
+    if entries is None:
         return None
-    rows = real_array(listed, "sources.distances", (None, 3))
+    rows = real_array(entries, "sources.distances", (None, 3))
     first, second = ends = rows[:, :2].astype(int).T
     if (rows[:, :2] != ends.T).any() or ends.min() < 1 or ends.max() > n_k or (first == second).any():
         raise InputError(f"sources.distances: expected [first, second, mm], sources from 1 to {n_k}")

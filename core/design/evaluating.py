@@ -1,4 +1,4 @@
-"""What a design gains: reconstructions of independent noise by the scanner that it began with, and by itself."""
+"""Evaluation of a design: reconstructions from independent noise, for the scanner at the start and the one found."""
 
 from typing import NamedTuple
 
@@ -14,64 +14,72 @@ from ..reconstruction.scores.images import nrmse
 from ..recording import recorded_warnings
 from .recipe import DesignRecipe
 
-_RESAMPLES = 4000
+_RESAMPLES = 4000  # of the bootstrap
 
 
 class Gain(NamedTuple):
-    """Scores of both scanners, and by which share the second is better, with its 95 % interval."""
+    """Scores of two scanners, and the relative improvement from the first to the second."""
 
     score: str
-    """``"NRMSE"``, less is better, or ``"lesion SNR"``, more is better."""
+    """Name of the score: ``"NRMSE"``, where less is better, or ``"lesion SNR"``, where more is better."""
     start: float
+    """Score of the scanner at the start."""
     found: float
+    """Score of the scanner that was found."""
     gain: float
+    """Relative improvement, such as 0.5 for an SNR that is half as high again."""
     low: float
+    """Lower end of the gain's 95 % interval."""
     high: float
+    """Upper end of the gain's 95 % interval."""
 
 
 def evaluate(
     recipe: DesignRecipe, start: PinholeSystem, found: PinholeSystem, progress: Progress | None = None
 ) -> Gain:
-    """How much better a scanner is than another in the recipe's ``[evaluation]``, at equal scan time.
+    """Return how much better the scanner `found` is than `start` in the recipe's ``[evaluation]``, at equal scan time.
 
-    Each draw of noise is reconstructed by OSEM for both. The score is the voxels' NRMSE; or, of a lesion, the SNR of what a
-    template of it reads from volumes with and without it: the difference of the means by the root mean variance. The
-    interval is by bootstrap over the draws, in pairs (Efron, Tibshirani 1993, chapter 13).
+    Each draw of noise is reconstructed by OSEM for both scanners. The score is the NRMSE of the voxels or, with a lesion,
+    the SNR of a template: the lesion's volume, multiplied with the reconstructions with and without lesion and summed. The
+    SNR is the difference of the means divided by the root mean variance. The interval is by bootstrap over pairs of draws
+    (Efron, Tibshirani 1993, chapter 13). `progress` is called with (reconstructions done, total).
     """
     if recipe["evaluation.body"] is None:
         raise InputError("evaluation.body: missing; name a phantom")
     (body,), lesion = recipe.volumes(recipe["evaluation.body"]), recipe["evaluation.lesion"]
     scenes = [body] if lesion is None else [body, body + recipe.volumes(lesion)[0]]
     draws, seed = recipe["evaluation.draws"], recipe["evaluation.seed"]
-    updates = recipe["evaluation.iterations"], recipe["evaluation.subsets"]
+    osem_settings = recipe["evaluation.iterations"], recipe["evaluation.subsets"]
     readings = np.empty((2, len(scenes), draws))
-    for done, (s, i, n) in enumerate(np.ndindex(readings.shape)):
+    for number, (s, i, n) in enumerate(np.ndindex(readings.shape)):
         if n == 0:
             with recorded_warnings():
                 A = recipe.projector((start, found)[s])
             mean = A(scenes[i]) + A.background
-        counts = sample_counts(mean, seed + done)  # each scanner and each scene has noise of its own
-        volume = osem(A, counts, *updates, background=A.background).volume.array
+        counts = sample_counts(mean, seed + number)  # independent noise for each scanner and scene
+        volume = osem(A, counts, *osem_settings, background=A.background).volume.array
         readings[s, i, n] = nrmse(volume, body) if lesion is None else (volume * (scenes[1] - body)).sum()
-        tell(progress, done + 1, readings.size)
+        tell(progress, number + 1, readings.size)
     return _gain("NRMSE" if lesion is None else "lesion SNR", readings, seed)
 
 
 def _gain(name: str, readings: Floats, seed: int) -> Gain:
-    """The gain told by readings (2, scenes, draws) of both scanners."""
+    """Return the gain computed from readings (2, scenes, draws): NRMSE of one scene, or template sums of two scenes."""
 
-    def scores(some: Floats) -> Floats:
-        if some.shape[1] == 1:
-            return some[:, 0].mean(axis=1)
-        spread = np.sqrt(some.var(axis=2, ddof=1).mean(axis=1))
-        return (some[:, 1].mean(axis=1) - some[:, 0].mean(axis=1)) / np.where(spread > 0, spread, np.nan)
+    def scores(readings: Floats) -> Floats:
+        """Return the score (2,) of each scanner."""
+        if readings.shape[1] == 1:
+            return readings[:, 0].mean(axis=1)
+        deviation = np.sqrt(readings.var(axis=2, ddof=1).mean(axis=1))
+        return (readings[:, 1].mean(axis=1) - readings[:, 0].mean(axis=1)) / np.where(deviation > 0, deviation, np.nan)
 
-    def better(some: Floats) -> float:
-        first, second = scores(some)
-        return float(1 - second / first if some.shape[1] == 1 else second / first - 1)
+    def improvement(readings: Floats) -> float:
+        """Return the relative improvement from the first to the second scanner."""
+        first, second = scores(readings)
+        return float(1 - second / first if readings.shape[1] == 1 else second / first - 1)
 
-    draw, n = np.random.default_rng(seed), readings.shape[2]
-    found = [better(readings[:, :, draw.integers(n, size=n)]) for _ in range(_RESAMPLES)]
-    low, high = np.nanpercentile(found, [2.5, 97.5])
+    rng, n = np.random.default_rng(seed), readings.shape[2]
+    resampled = [improvement(readings[:, :, rng.integers(n, size=n)]) for _ in range(_RESAMPLES)]
+    low, high = np.nanpercentile(resampled, [2.5, 97.5])
     first, second = scores(readings).tolist()
-    return Gain(name, first, second, better(readings), float(low), float(high))
+    return Gain(name, first, second, improvement(readings), float(low), float(high))

@@ -1,4 +1,4 @@
-"""What is in a set's folder, and whether it is whole: every byte of every file."""
+"""Check and repair of event sets: content of the folder, and every byte of every file."""
 
 import os
 from collections import Counter
@@ -11,230 +11,247 @@ from ..errors import InputError, refusing
 from ..files import AnyPath, ensure_folder, final_name, is_leftover
 from ..memory import cores
 from ..progress import Progress, tell
-from .event_files import Place, header, verify
-from .folders import ASKED, INDEX, INPUT_LIST, INPUTS, RECIPE, SetFolder
+from .event_files import FileLocation, read_header, verify
+from .folders import INDEX, INPUT_LIST, INPUTS, RECIPE, REQUESTS, SetFolder
 from .index import column
 from .store import EVENTS, LOCK, SHARDS
 
 
 @dataclass(frozen=True)
 class Fault:
-    """Something that is wrong in a set."""
+    """A fault of an event set, found by `check`."""
 
-    kind: str  # "missing", "damaged", "another recipe", "leftover", "foreign", "index" or "input"
+    kind: str
+    """Kind of fault: "missing", "damaged", "another recipe", "leftover", "foreign", "index" or "input"."""
     path: Path
-    text: str  # one line
-    event: int | None = None  # that `repair` makes anew
+    """Path of the file that is at fault."""
+    text: str
+    """Description in one line, which begins with the path."""
+    event: int | None = None
+    """Number of the event that must be made again; None where no event is lost."""
 
 
 @dataclass(frozen=True)
 class Status:
-    """What is in a set, by the names and headers of its files."""
+    """Content of an event set, by the names and headers of its files."""
 
-    asked: int  # events
+    asked: int
+    """Number of requested events."""
     made: int
+    """Number of these that are stored."""
     missing: list[int]
-    size: int  # bytes of the events
-    phantoms: dict[str, int]  # events made, by phantom
-    splits: dict[str, int]  # and by split
-    builds: dict[str, int]  # and by the build of mphDRR that made them; "" of earlier versions
-    shards: int = 0  # files of many events
+    """Numbers of the requested events that are not stored."""
+    size: int
+    """Bytes of the stored events."""
+    phantoms: dict[str, int]
+    """Number of stored events by phantom."""
+    splits: dict[str, int]
+    """Number of stored events by split; "none" for events without one."""
+    builds: dict[str, int]
+    """Number of stored events by the build of mphDRR that made them; "" for builds of version 0.1."""
+    shards: int = 0
+    """Number of shards, files of many events."""
 
 
 def status(folder: AnyPath) -> Status:
-    """What is in a set; events count if their files have the length and recipe that they should (`check` reads all bytes).
+    """Count the events of a set whose files have the expected size and recipe, without reading their data.
 
-    `InputError` where the folder is no event set.
+    `check` also reads the data. `InputError` where the folder is no event set.
     """
     target = SetFolder(folder)
     fingerprint = target.recipe.fingerprint
-    headers = {number: target.header(number, place) for number, place in target.places.items()}
-    made = {number: found for number, found in headers.items() if found is not None and found.recipe == fingerprint}
-    asked = target.planned() or list(made)
-    made = {number: made[number] for number in asked if number in made}
-    rows = [target.line(number) for number in made]
+    all_headers = {number: target.valid_header(number, location) for number, location in target.locations.items()}
+    headers = {n: header for n, header in all_headers.items() if header is not None and header.recipe == fingerprint}
+    requested = target.requested_numbers() or list(headers)
+    headers = {number: headers[number] for number in requested if number in headers}
+    rows = [target.line(number) for number in headers]
     return Status(
-        asked=len(asked),
-        made=len(made),
-        missing=[number for number in asked if number not in made],
-        size=sum(found.size for found in made.values()),
+        asked=len(requested),
+        made=len(headers),
+        missing=[number for number in requested if number not in headers],
+        size=sum(header.size for header in headers.values()),
         phantoms=dict(sorted(Counter(column(row, 1) for row in rows).items())),
         splits=dict(sorted(Counter(column(row, 2) or "none" for row in rows).items())),
-        builds=dict(sorted(Counter(found.build for found in made.values()).items())),
+        builds=dict(sorted(Counter(header.build for header in headers.values()).items())),
         shards=len(target.store.shard_paths()),
     )
 
 
 def check(folder: AnyPath, progress: Progress | None = None) -> list[Fault]:
-    """All faults of a set: every byte of every file is read. Empty where there are none.
+    """Read every byte of a set's files and return all faults; an empty list for a set without faults.
 
-    Found are events that are missing, cut, changed, or of another recipe; files that do not belong to the set, and those
-    that an interrupted work left; an index or a copy of an input that is not as it was written.
+    Faults are events that are missing, cut, changed or of another recipe; files that do not belong to the set; leftovers of
+    interrupted processes; and an index or a copy of an input file that differs from what was written.
 
     Parameters
     ----------
     folder
-        The set's.
+        Folder of the set.
     progress
         Called as ``progress(events read, events)``; may raise `Cancelled`.
 
     Raises
     ------
     InputError
-        The folder is no event set, or its recipe cannot be understood any more.
+        The folder is no event set, or its recipe cannot be read any more.
     """
     target = SetFolder(folder)
-    faults = list(_inputs(target))
-    if faults:  # what events should be is not known without them
+    faults = list(_input_faults(target))
+    if faults:  # without the input files, the fingerprint of the recipe is unknown
         return faults
     faults += index_faults(folder)
-    planned, places = set(_planned(target)), target.store.places()
+    requested, locations = set(_expected_numbers(target)), target.store.locations()
     fingerprint = target.recipe.fingerprint
 
-    def faults_of(number: int) -> Fault | None:
-        place = places.get(number, Place(str(target.store.event_path(number))))
-        fault = _event_fault(place, number, fingerprint)
-        if fault is None or number in planned:
+    def find_fault(number: int) -> Fault | None:
+        """Return the fault of an event; "foreign" for a faulty file of an event that nobody requested."""
+        location = locations.get(number, FileLocation(str(target.store.event_path(number))))
+        fault = _event_fault(location, number, fingerprint)
+        if fault is None or number in requested:
             return fault
-        return Fault("foreign", fault.path, f"{fault.text}, and not in the index")  # nobody asked for it
+        return Fault("foreign", fault.path, f"{fault.text}, and not in the index")
 
-    numbers = sorted({*planned, *places})
+    numbers = sorted({*requested, *locations})
     with ThreadPoolExecutor(cores()) as pool:
-        for done, fault in enumerate(pool.map(faults_of, numbers), 1):
+        for n_checked, fault in enumerate(pool.map(find_fault, numbers), 1):
             if fault is not None:
                 faults.append(fault)
-            tell(progress, done, len(numbers))
-    return [*faults, *_foreign(target)]
+            tell(progress, n_checked, len(numbers))
+    return [*faults, *_foreign_files(target)]
 
 
 def repair(folder: AnyPath, faults: list[Fault]) -> list[int]:
-    """Mend what `check` found, and touch nothing else; the numbers of the events that are to be made again.
+    """Repair the faults that `check` found, leave all else, and return the numbers of the events to make again.
 
-    Damaged events and those of another recipe are removed, leftovers of interrupted works too. Files that do not belong to
-    the set may be the user's: they move to a folder beside it, ``SET-foreign``. The index is written anew.
+    Damaged events, events of another recipe and leftovers of interrupted processes are removed. Files that do not belong to
+    the set may be the user's: they are moved to a folder beside it, ``SET-foreign``. The index is written again.
 
     Raises
     ------
     InputError
-        A copy of an input is damaged: only its original can replace it; or a file cannot be moved.
+        A copy of an input file is damaged, which only the original can replace; or a file cannot be moved.
     """
     target = SetFolder(folder)
     for fault in faults:
         if fault.kind == "input":
             raise InputError(f"{fault.text}; put the original back, or make a new set")
-    planned = _planned(target)
+    requested = _expected_numbers(target)
     shards = {fault.path for fault in faults if fault.path.parent == target.store.shards and fault.event is not None}
     if shards:
-        target.store.unpack(shards=shards)  # what is whole in them stays
+        target.store.unpack(shards=shards)  # which keeps their intact events
     for fault in faults:
         if fault.kind == "foreign":
-            _move(fault.path, target)
+            _move_aside(fault.path, target)
         elif fault.kind in ("damaged", "another recipe", "leftover") and fault.path not in shards:
             _remove(fault.path, target)
     if any(fault.kind == "index" for fault in faults):
-        target.index.complete(target.store.places, planned, anew=True)
+        target.index.complete(target.store.locations, requested, redraw=True)
     return sorted({fault.event for fault in faults if fault.event is not None})
 
 
-def _inputs(target: SetFolder) -> Iterator[Fault]:
-    """Copies of what the recipe names that are missing or not as they were."""
+def _input_faults(target: SetFolder) -> Iterator[Fault]:
+    """Yield a fault for each copy of an input file that is missing or has changed."""
     copies = target.copies()
     for name in target.recipe.files:
         path = copies[name].path if name in copies else target.inputs / INPUT_LIST
         try:
             if name not in copies:
-                raise InputError(f"{path}: it has no copy of {name}")
+                raise InputError(f"{path}: lists no copy of {name}")
             if copies[name].current_sha256() != copies[name].sha256:
-                raise InputError(f"{path}: changed: it is not the {name} that the set was begun with")
+                raise InputError(f"{path}: changed: not the {name} with which the set was begun")
         except InputError as error:
             yield Fault("input", path, str(error))
 
 
-def _planned(target: SetFolder) -> list[int]:
-    """The events that the set should have: those asked for; where nothing says these, all that are there of its recipe."""
+def _expected_numbers(target: SetFolder) -> list[int]:
+    """Return the numbers of the events that the set should have.
+
+    These are the requested events. Where no request is stored, stored events of the set's recipe belong to it as well.
+    """
     try:
-        asked = target.planned()
+        requested = target.requested_numbers()
     except InputError:
-        asked = []
-    if target.asked_path.is_dir() and asked:
-        return asked
-    places = target.store.places()  # of which the index may have been cut
-    return sorted({*asked, *(n for n, place in places.items() if not asked or target.is_made(n, place))})
+        requested = []
+    if target.requests_path.is_dir() and requested:
+        return requested
+    locations = target.store.locations()  # the index may have been cut and lack some
+    stored = (n for n, location in locations.items() if not requested or target.is_made(n, location))
+    return sorted({*requested, *stored})
 
 
 def index_faults(folder: AnyPath) -> list[Fault]:
-    """What is wrong with the index alone, as `check` says it."""
+    """Return the faults of the index alone, as `check` returns them."""
     target = SetFolder(folder)
-    index, made = target.index, target.store.places()
+    index, locations = target.index, target.store.locations()
     if not index.path.is_file():
-        return [Fault("index", index.path, f"{index.path}: missing")] if made else []
-    planned = set(_planned(target))
+        return [Fault("index", index.path, f"{index.path}: missing")] if locations else []
+    requested = set(_expected_numbers(target))
     try:
-        there = index.read()
+        stored = index.read()
     except InputError:
-        there = {}
-    wanted = {number: index.line(number) for number in (*there, *made) if number in planned}
-    if index.path.read_bytes() != index.text(wanted):
-        text = f"{index.path}: changed: it is not what recipe.toml says of these events"
-        return [Fault("index", index.path, text)]
+        stored = {}
+    lines = {number: index.line(number) for number in (*stored, *locations) if number in requested}
+    if index.path.read_bytes() != index.content(lines):
+        return [Fault("index", index.path, f"{index.path}: changed: its rows differ from those that recipe.toml gives")]
     return []
 
 
-def _event_fault(place: Place, number: int, fingerprint: str) -> Fault | None:
-    path = Path(place.path)
+def _event_fault(location: FileLocation, number: int, fingerprint: str) -> Fault | None:
+    """Return the fault of an event's file, of which every byte is read; None where it is intact and of this recipe."""
+    path = Path(location.path)
     if not path.exists():
         return Fault("missing", path, f"{path}: missing", number)
     try:
-        found = header(place)
-        if found.recipe != fingerprint:
-            text = f"{path}: of another recipe ({found.recipe[:8]}…, the set's is {fingerprint[:8]}…)"
+        file_header = read_header(location)
+        if file_header.recipe != fingerprint:
+            text = f"{path}: of another recipe ({file_header.recipe[:8]}…, the set's is {fingerprint[:8]}…)"
             return Fault("another recipe", path, text, number)
-        if found.event != number:
-            return Fault("damaged", path, f"{path}: it is event {found.event}", number)
-        verify(place)
+        if file_header.event != number:
+            return Fault("damaged", path, f"{path}: is event {file_header.event}", number)
+        verify(location)
     except InputError as error:
         return Fault("damaged", path, str(error), number)
     return None
 
 
-def _foreign(target: SetFolder) -> Iterator[Fault]:
-    """Files and folders that do not belong to the set."""
+def _foreign_files(target: SetFolder) -> Iterator[Fault]:
+    """Yield a fault for each file or folder that does not belong to the set, leftovers of interrupted processes included."""
     store = target.store
     inputs = {INPUT_LIST, *(copy.path.name for copy in target.copies().values())}
-    # They may lie beside the recipe.
+    # The originals of the input files may lie in the set's folder.
     originals = [Path(os.path.normpath(target.path / name)) for name in target.recipe.files]
-    for folder, known in (
-        (target.path, {RECIPE, INDEX, INPUTS, ASKED, EVENTS, SHARDS}),
+    for folder, expected in (
+        (target.path, {RECIPE, INDEX, INPUTS, REQUESTS, EVENTS, SHARDS}),
         (target.inputs, inputs),
-        (target.asked_path, target.asked_names),  # of works that began at once some may lie within others
-        (store.events, {store.event_path(number).name for number in store.alone()}),
+        (target.requests_path, target.request_names),  # ranges of simultaneous processes may overlap
+        (store.events, {store.event_path(number).name for number in store.single_events()}),
         (store.shards, {LOCK, *(path.name for path in store.shard_paths())}),
     ):
         for name in sorted(os.listdir(folder)) if folder.is_dir() else ():
             path = folder / name
-            if name in known or any(original.is_relative_to(path) for original in originals):
+            if name in expected or any(original.is_relative_to(path) for original in originals):
                 continue
             if is_leftover(path):
-                yield Fault("leftover", path, f"{path}: left by a work that was interrupted")
-            elif final_name(name) is None:  # else it is under way
-                yield Fault("foreign", path, f"{path}: not of this set")
+                yield Fault("leftover", path, f"{path}: left by an interrupted process")
+            elif final_name(name) is None:  # otherwise a process is writing it
+                yield Fault("foreign", path, f"{path}: does not belong to this set")
 
 
 def _remove(path: Path, target: SetFolder) -> None:
-    """Remove a file of the set; a folder in its place is not the set's, and moves."""
+    """Remove a file of the set; a folder of its name does not belong to the set and is moved aside."""
     if path.is_dir() and not path.is_symlink():
-        _move(path, target)
+        _move_aside(path, target)
         return
     with refusing(path, "cannot be removed"):
         path.unlink(missing_ok=True)
 
 
-def _move(path: Path, target: SetFolder) -> None:
-    """Move what does not belong to a set to a folder beside it."""
-    beside = ensure_folder(target.path.with_name(f"{target.path.name}-foreign"))
-    new, number = beside / path.name, 1
-    while new.exists():
+def _move_aside(path: Path, target: SetFolder) -> None:
+    """Move a file that does not belong to a set to the folder ``SET-foreign`` beside the set."""
+    foreign_folder = ensure_folder(target.path.with_name(f"{target.path.name}-foreign"))
+    destination, number = foreign_folder / path.name, 1
+    while destination.exists():
         number += 1
-        new = beside / f"{path.stem}-{number}{path.suffix}"
-    with refusing(path, f"cannot be moved to {new}"):
-        path.rename(new)
+        destination = foreign_folder / f"{path.stem}-{number}{path.suffix}"
+    with refusing(path, f"cannot be moved to {destination}"):
+        path.rename(destination)

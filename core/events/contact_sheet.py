@@ -1,4 +1,4 @@
-"""A picture of some events, one in a row: slices of the truth, the images of all modules, a Radon view, a sinogram."""
+"""Contact sheet of events, one per row: slices of the truth, images of all modules, a Radon view, a sinogram."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -18,230 +18,245 @@ from ..volumes.volume import Volume
 from .event_set import Event
 
 _PAPER, _INK, _FAINT, _RULE, _CROSS = "#14161a", "#eceef2", "#98a2b0", "#2b3038", "#ffffff"
-_SIDE, _GAP, _GROUP, _MARGIN = 320, 8, 36, 44  # pixels: of a slice; between slices, groups, and to the page's edge
+_SIDE, _GAP, _GROUP, _MARGIN = 320, 8, 36, 44  # pixels: side of a slice; gaps between slices and groups; page margin
 _HEADING, _TITLE, _TEXT = 30.0, 21.0, 15.0  # size of text, pixels
 _HEAD, _ABOVE, _BELOW = 96, 66, 50  # pixels above all rows, and above and below a row's pictures
-_WIDEST = 1.7  # of a mosaic's width by its height
-_SHARE = 0.9995  # of the numbers are not brighter than the last colour: single hot pixels do not darken the others
-_NEAR = 0.06  # of the grid's sides: a slice may be so far from the middle where more is to be seen
-_MIDDLES, _NEARLY_ALL = (0.5, 0.625, 0.75, 1.0), 0.998
-"""Shares of the images' sides: the smallest is shown that has nearly all that there is in every event."""
+_WIDEST = 1.7  # largest ratio of a mosaic's width to its height
+_QUANTILE = 0.9995  # quantile of the values at the last colour, so that single hot pixels do not darken the others
+_SEARCH = 0.06  # fraction of the grid's side within which a slice with more contrast than the central one is searched
+_CENTRAL_FRACTIONS, _ENOUGH = (0.5, 0.625, 0.75, 1.0), 0.998
+"""Fractions of the images' sides that may be shown, and the fraction of the counts that the shown part must hold."""
 
-# The axis across a slice, and those to the right and upward: seen from the head, from the front and from the left.
+# Axes across a slice, to the right and upward, for views from the head, from the front and from the left.
 _SLICES = ((2, 0, 1), (1, 0, 2), (0, 1, 2))
 
 
 @dataclass(frozen=True, eq=False)
-class ShownEvent:
-    """What a row of the sheet shows."""
+class SheetRow:
+    """Content of a row of the contact sheet: texts and arrays of one event."""
 
     title: str
-    line: str  # beside it
-    truth: Volume  # on a grid along the world's axes
-    middle: Floats  # (3,), mm: where the slices meet
+    """Heading of the row."""
+    line: str
+    """Text beside the heading."""
+    truth: Volume
+    """True volume, on a grid along the world's axes."""
+    center: Floats
+    """Point (3,), mm, near which the three slices intersect."""
     model: str = ""
+    """Name of the images' model."""
     unit: str = ""
-    images: Floats32 | None = None  # (M, n_v, n_u); None for none
-    rings: Integers | None = None  # (M,), of the images
-    radon: Floats32 | None = None  # (n, n_v, n_u); None for none
+    """Unit of the images."""
+    images: Floats32 | None = None
+    """Images (M, n_v, n_u); None for a row without images."""
+    rings: Integers | None = None
+    """Index (M,) of each module's ring."""
+    radon: Floats32 | None = None
+    """Parallel projections (n, n_v, n_u), value x mm; None for a row without them."""
     radon_degrees: float = 180.0
+    """Range of the projections' angles, degrees."""
 
 
 def contact_sheet(events: Sequence[Event], model: str | None = None, title: str = "", lines: str = "") -> Page:
-    """A page with a row for each event; `title` and `lines` stand above them.
+    """Draw a page with a row for each event, below `title` and `lines`.
 
     Parameters
     ----------
     events
-        One or more, such as ``[events[0], events[7]]``.
+        One or more events, such as ``[events[0], events[7]]``.
     model
-        Whose images are shown; by default the recipe's first.
+        Name of the model whose images are shown; by default the recipe's first.
 
     Raises
     ------
     InputError
-        No events, more than a page holds, or no such model.
+        There are no events, more than a page holds, or there is no such model.
     """
-    return drawn([shown_event(event, model) for event in events], title, lines)
+    return draw_sheet([sheet_row(event, model) for event in events], title, lines)
 
 
-def shown_event(event: Event, model: str | None = None) -> ShownEvent:
-    """What a sheet shows of an event."""
+def sheet_row(event: Event, model: str | None = None) -> SheetRow:
+    """Return the row of an event, with the images of a model, by default the recipe's first."""
     recipe = event.recipe
     names = [name for name in recipe.models if name in event.models]
-    found: dict[str, Any] = {}
+    fields: dict[str, Any] = {}
     if model is not None or names:
         name = names[0] if model is None else model
-        found = {"model": name, "images": event.images(name), "unit": event.unit(name), "rings": event.system.rings()}
+        fields = {"model": name, "images": event.images(name), "unit": event.unit(name), "rings": event.system.rings()}
     if recipe.radon is not None:
-        found |= {"radon": event.radon(max(recipe.radon.counts)), "radon_degrees": recipe.radon.degrees}
+        fields |= {"radon": event.radon(max(recipe.radon.counts)), "radon_degrees": recipe.radon.degrees}
     mirrored = ", mirrored" if event.attributes["mirror"] else ""
-    line = f"({_listed(event.position)}) mm    (φ, θ, ψ) = ({_listed(event.euler_degrees)})°{mirrored}"
+    line = f"({_numbers_text(event.position)}) mm    (φ, θ, ψ) = ({_numbers_text(event.euler_degrees)})°{mirrored}"
     title = "  ·  ".join(filter(None, (f"Event {event.number}", event.name, event.split)))
-    return ShownEvent(title, line, event.truth, event.position, **found)
+    return SheetRow(title, line, event.truth, event.position, **fields)
 
 
-def drawn(events: Sequence[ShownEvent], title: str = "", lines: str = "") -> Page:
-    """The page of what is shown of some events; `InputError` for none, or more than a page holds."""
-    row = _ABOVE + _SIDE + _BELOW
-    most = (LARGEST - _HEAD) // row
-    if not 1 <= len(events) <= most:
-        raise InputError(f"contact sheet: expected 1 to {most} events, got {len(events)}")
-    share = max((_share(event.images) for event in events if event.images is not None), default=1.0)
-    rows = [_panels(event, share) for event in events]
-    width = 2 * _MARGIN + max(sum(panel.room for panel in panels) for panels in rows) - _GROUP
-    page = Page(width, _HEAD + row * len(rows), _PAPER)
+def draw_sheet(rows: Sequence[SheetRow], title: str = "", lines: str = "") -> Page:
+    """Draw a page of these rows, below `title` and `lines`; `InputError` for no rows, or more than a page holds."""
+    row_height = _ABOVE + _SIDE + _BELOW
+    max_rows = (LARGEST - _HEAD) // row_height
+    if not 1 <= len(rows) <= max_rows:
+        raise InputError(f"contact sheet: expected 1 to {max_rows} events, got {len(rows)}")
+    fraction = max((_central_fraction(row.images) for row in rows if row.images is not None), default=1.0)
+    panels_by_row = [_row_panels(row, fraction) for row in rows]
+    width = 2 * _MARGIN + max(sum(panel.width_with_gap for panel in panels) for panels in panels_by_row) - _GROUP
+    page = Page(width, _HEAD + row_height * len(panels_by_row), _PAPER)
     page.text(title, _MARGIN, 54, _HEADING, _INK)
     page.text(lines, page.width - _MARGIN, 54, _TEXT, _FAINT, "end")
-    for index, (event, panels) in enumerate(zip(events, rows, strict=True)):
-        top = _HEAD + index * row
+    for index, (row, panels) in enumerate(zip(rows, panels_by_row, strict=True)):
+        top = _HEAD + index * row_height
         page.line([(_MARGIN, top - 14), (page.width - _MARGIN, top - 14)], _RULE, 1.5)
-        page.text(event.title, _MARGIN, top + 20, _TITLE, _INK)
-        page.text(event.line, _MARGIN + letters.width(event.title, _TITLE) + 28, top + 20, _TEXT, _FAINT)
+        page.text(row.title, _MARGIN, top + 20, _TITLE, _INK)
+        page.text(row.line, _MARGIN + letters.width(row.title, _TITLE) + 28, top + 20, _TEXT, _FAINT)
         left = _MARGIN
         for panel in panels:
-            _draw(page, panel, left, top + _ABOVE)
-            left += panel.room
+            _draw_panel(page, panel, left, top + _ABOVE)
+            left += panel.width_with_gap
     return page
 
 
 @dataclass(frozen=True, eq=False)
 class _Panel:
-    """A picture with words above and below."""
+    """A picture of a row, with texts above and below."""
 
-    picture: Bytes  # (h, w, 3)
-    width: int  # pixels on the page
-    height: int
-    above: str = ""
-    below: str = ""
-    pixels_per_mm: float = 0.0  # where it has a scale bar
-    cross: tuple[float, float] | None = None  # pixels from the upper left corner: where the other slices cut it
-    gap: int = _GROUP
-    frame: int = _SIDE  # columns in whose middle it stands, between `_SIDE` rows
+    picture: Bytes  # (h, w, 3), colours
+    width: int  # page pixels
+    height: int  # page pixels
+    above: str = ""  # text above the picture
+    below: str = ""  # text below the picture
+    pixels_per_mm: float = 0.0  # scale of the scale bar; 0: no bar
+    cross: tuple[float, float] | None = None  # crossing of the other slices, page pixels from the upper left corner
+    gap: int = _GROUP  # page pixels between this panel and the next
+    frame: int = _SIDE  # page columns of the frame, `_SIDE` rows high, in which the picture is centred
 
     @property
-    def room(self) -> int:
-        """Columns that it takes, with the gap that follows."""
+    def width_with_gap(self) -> int:
+        """The page columns that the panel takes, its gap included."""
         return self.frame + self.gap
 
 
-def _panels(event: ShownEvent, share: float) -> list[_Panel]:
-    """The pictures of an event, from left to right; of the images a share of their sides."""
-    panels = _slices(event)
-    if event.images is not None and event.rings is not None:
-        panels.append(_mosaic(event, event.images, event.rings, share))
-    if event.radon is not None:
-        panels += _radon(event, event.radon)
+def _row_panels(row: SheetRow, fraction: float) -> list[_Panel]:
+    """Return the panels of a row, from left to right; of the images, the central `fraction` of their sides is shown."""
+    panels = _slice_panels(row)
+    if row.images is not None and row.rings is not None:
+        panels.append(_mosaic_panel(row, row.images, row.rings, fraction))
+    if row.radon is not None:
+        panels += _radon_panels(row, row.radon)
     return panels
 
 
-def _slices(event: ShownEvent) -> list[_Panel]:
-    grid, array = event.truth.grid, event.truth.array
-    display = Display("inferno" if event.truth.quantity == "activity" else "grey")
-    window = 0.0, _bright(array[array > 0])
-    index = _telling(event)
-    middle = (grid.affine @ [*index, 1.0])[:3]
+def _slice_panels(row: SheetRow) -> list[_Panel]:
+    """Return the panels of the three orthogonal slices through the truth."""
+    grid, array = row.truth.grid, row.truth.array
+    display = Display("inferno" if row.truth.quantity == "activity" else "grey")
+    window = 0.0, _upper_limit(array[array > 0])
+    index = _slice_indices(row)
+    point = (grid.affine @ [*index, 1.0])[:3]
     extent = grid.spacing * grid.shape
     scale = _SIDE / float(extent.max())
     low = grid.center - extent / 2
     panels: list[_Panel] = []
     for axis, right, up in _SLICES:
         size = max(1, round(float(extent[right]) * scale)), max(1, round(float(extent[up]) * scale))
-        across, upward = (float(middle[a] - low[a]) * scale for a in (right, up))
+        across, upward = (float(point[a] - low[a]) * scale for a in (right, up))
         picture = display.colored(array.take([index[axis]], axis).squeeze(axis).T[::-1], window)
-        above, bar = ("", 0.0) if panels else (f"Truth, {_range(window, event.truth.unit)}", scale)
-        below = f"{'xyz'[right]} {'xyz'[up]},  {'xyz'[axis]} = {number(round(float(middle[axis]), 1))} mm"
+        above, bar = ("", 0.0) if panels else (f"Truth, {_range_text(window, row.truth.unit)}", scale)
+        below = f"{'xyz'[right]} {'xyz'[up]},  {'xyz'[axis]} = {number(round(float(point[axis]), 1))} mm"
         cross, gap = (across, size[1] - upward), _GROUP if axis == 0 else _GAP
         panels.append(_Panel(picture, *size, above, below, bar, cross, gap, max(size[0], _SIDE // 2)))
     return panels
 
 
-def _telling(event: ShownEvent) -> list[int]:
-    """Indices of the slices: through the middle, or near it where those there have much less in them."""
-    grid, array = event.truth.grid, event.truth.array
-    place = np.rint((grid.index_from_world @ [*event.middle, 1.0])[:3]).astype(int)
-    found = []
+def _slice_indices(row: SheetRow) -> list[int]:
+    """Return the index of the slice along each axis: the one nearest to the row's centre with enough contrast.
+
+    Contrast is the standard deviation of a slice; enough is 80 % of the largest within `_SEARCH` of the grid's side.
+    """
+    grid, array = row.truth.grid, row.truth.array
+    center_index = np.rint((grid.index_from_world @ [*row.center, 1.0])[:3]).astype(int)
+    indices = []
     for axis, n in enumerate(grid.shape):
-        middle, reach = int(np.clip(place[axis], 0, n - 1)), round(_NEAR * n)
-        near = list(range(max(0, middle - reach), min(n, middle + reach + 1)))
-        spread = [float(array.take(i, axis).std()) for i in near]
-        good = [i for i, s in zip(near, spread, strict=True) if s >= 0.8 * max(spread)]
-        found.append(min(good, key=lambda i: abs(i - middle)))
-    return found
+        center, reach = int(np.clip(center_index[axis], 0, n - 1)), round(_SEARCH * n)
+        candidates = list(range(max(0, center - reach), min(n, center + reach + 1)))
+        contrasts = [float(array.take(i, axis).std()) for i in candidates]
+        promising = [i for i, s in zip(candidates, contrasts, strict=True) if s >= 0.8 * max(contrasts)]
+        indices.append(min(promising, key=lambda i: abs(i - center)))
+    return indices
 
 
-def _middle(images: Floats32, share: float) -> Floats32:
-    """The middle of images (M, n_v, n_u), a share of their sides."""
-    off_v, off_u = (round(n * (1 - share) / 2) for n in images.shape[1:])
-    return images[:, off_v : images.shape[1] - off_v, off_u : images.shape[2] - off_u]
+def _central_part(images: Floats32, fraction: float) -> Floats32:
+    """Return the central part of images (M, n_v, n_u), a fraction of their sides."""
+    margin_v, margin_u = (round(n * (1 - fraction) / 2) for n in images.shape[1:])
+    return images[:, margin_v : images.shape[1] - margin_v, margin_u : images.shape[2] - margin_u]
 
 
-def _share(images: Floats32) -> float:
-    """The smallest of `_MIDDLES` that has nearly all there is."""
+def _central_fraction(images: Floats32) -> float:
+    """Return the smallest of `_CENTRAL_FRACTIONS` whose central part holds `_ENOUGH` of the images' sum."""
     total = float(np.abs(images).sum(dtype=float))
-    parts = ((share, float(np.abs(_middle(images, share)).sum(dtype=float))) for share in _MIDDLES)
-    return next((share for share, part in parts if part >= _NEARLY_ALL * total), 1.0)
+    sums = ((f, float(np.abs(_central_part(images, f)).sum(dtype=float))) for f in _CENTRAL_FRACTIONS)
+    return next((f for f, part_sum in sums if part_sum >= _ENOUGH * total), 1.0)
 
 
-def _mosaic(event: ShownEvent, images: Floats32, rings: Integers, share: float) -> _Panel:
-    """All images, ring by ring; a ring takes several rows where that suits the page."""
-    whole = images.shape[1:]
-    images = _middle(images, share)
+def _mosaic_panel(row: SheetRow, images: Floats32, rings: Integers, fraction: float) -> _Panel:
+    """Return the panel of all images, ring by ring; a long ring takes several rows, so that the panel fits the page."""
+    full_shape = images.shape[1:]
+    images = _central_part(images, fraction)
     n_v, n_u = images.shape[1:]
     longest = int(np.bincount(rings).max())
 
-    def sides(columns: int) -> tuple[float, int, int]:
-        at = places(rings, columns)
-        down, across = int(at[:, 0].max()) + 1, int(at[:, 1].max()) + 1
-        tile = _SIDE / down / n_v  # pixels of the page to one of the images
-        return across * n_u * tile / _SIDE, down, across
+    def mosaic_size(columns: int) -> tuple[float, int, int]:
+        """Return the width of a mosaic of height 1, and its numbers of tiles down and across."""
+        positions = places(rings, columns)
+        n_down, n_across = int(positions[:, 0].max()) + 1, int(positions[:, 1].max()) + 1
+        tile = _SIDE / n_down / n_v  # page pixels per image pixel
+        return n_across * n_u * tile / _SIDE, n_down, n_across
 
-    choices = sorted({-(-longest // parts) for parts in range(1, longest + 1)} & set(range(1, COLUMNS + 1)))
-    fitting = [columns for columns in choices if sides(columns)[0] <= _WIDEST]
+    choices = sorted({-(-longest // n_rows) for n_rows in range(1, longest + 1)} & set(range(1, COLUMNS + 1)))
+    fitting = [columns for columns in choices if mosaic_size(columns)[0] <= _WIDEST]
     columns = max(fitting, default=choices[0])
-    _, down, across = sides(columns)
-    step = min(_SIDE // down, int(_WIDEST * _SIDE) // across)
-    tall = max(1, step - 2)
-    wide = max(1, min(round(tall * n_u / n_v), int(_WIDEST * _SIDE) // across))
-    window = 0.0, _bright(images)
-    colors = Display("inferno")
-    tiles = colors.colored(resized(as_seen(images).transpose(1, 2, 0), tall, wide), window)
-    sheet = np.empty((down * (tall + 2) - 2, across * (wide + 2) - 2, 3), np.uint8)
+    _, n_down, n_across = mosaic_size(columns)
+    tile_side = min(_SIDE // n_down, int(_WIDEST * _SIDE) // n_across)
+    tall = max(1, tile_side - 2)
+    wide = max(1, min(round(tall * n_u / n_v), int(_WIDEST * _SIDE) // n_across))
+    window = 0.0, _upper_limit(images)
+    display = Display("inferno")
+    tiles = display.colored(resized(as_seen(images).transpose(1, 2, 0), tall, wide), window)
+    sheet = np.empty((n_down * (tall + 2) - 2, n_across * (wide + 2) - 2, 3), np.uint8)
     sheet[:] = list(bytes.fromhex(_PAPER.removeprefix("#")))
-    for m, (row, column) in enumerate(places(rings, columns)):
-        top, left = row * (tall + 2), column * (wide + 2)
+    for m, (tile_row, tile_column) in enumerate(places(rings, columns)):
+        top, left = tile_row * (tall + 2), tile_column * (wide + 2)
         sheet[top : top + tall, left : left + wide] = tiles[:, :, m]
     size = sheet.shape[1], sheet.shape[0]
-    above = f"{event.model}: {len(images)} views, {_range(window, event.unit)}"
-    part = "" if share == 1.0 else f"middle {n_v} × {n_u} of "
-    below = f"{part}{whole[0]} × {whole[1]} pixels, ring by ring"
+    above = f"{row.model}: {len(images)} views, {_range_text(window, row.unit)}"
+    cropping = "" if fraction == 1.0 else f"middle {n_v} × {n_u} of "
+    below = f"{cropping}{full_shape[0]} × {full_shape[1]} pixels, ring by ring"
     return _Panel(sheet, *size, above, below, frame=size[0])
 
 
-def _radon(event: ShownEvent, radon: Floats32) -> list[_Panel]:
-    """The view at the first angle, and the sinogram of the row with most in it."""
-    count, n_v, n_u = radon.shape
-    window = 0.0, _bright(radon)
-    display = Display("inferno" if event.truth.quantity == "activity" else "grey")
+def _radon_panels(row: SheetRow, radon: Floats32) -> list[_Panel]:
+    """Return two panels: the Radon image at the first angle, and the sinogram of the pixel row with the largest sum."""
+    n_angles, n_v, n_u = radon.shape
+    window = 0.0, _upper_limit(radon)
+    display = Display("inferno" if row.truth.quantity == "activity" else "grey")
     scale = _SIDE / max(n_v, n_u)
     size = max(1, round(n_u * scale)), max(1, round(n_v * scale))
-    row = int(radon.sum(axis=(0, 2), dtype=float).argmax())
-    upper = (n_v - row - 0.5) * scale
-    above = f"Radon, {count} angles, {_range(window, f'{event.truth.unit} mm')}"
+    brightest_row = int(radon.sum(axis=(0, 2), dtype=float).argmax())
+    cross_height = (n_v - brightest_row - 0.5) * scale
+    above = f"Radon, {n_angles} angles, {_range_text(window, f'{row.truth.unit} mm')}"
     view = display.colored(as_seen(radon[0]), window)
-    sinogram = display.colored(radon[:, row, ::-1], window)
+    sinogram = display.colored(radon[:, brightest_row, ::-1], window)
     return [
-        _Panel(view, *size, above, f"at 0°, {n_v} × {n_u} pixels", cross=(-1.0, upper), gap=_GAP, frame=size[0]),
-        _Panel(sinogram, size[0], _SIDE, "", f"sinogram, 0 to {event.radon_degrees:g}°", frame=size[0]),
+        _Panel(view, *size, above, f"at 0°, {n_v} × {n_u} pixels", cross=(-1.0, cross_height), gap=_GAP, frame=size[0]),
+        _Panel(sinogram, size[0], _SIDE, "", f"sinogram, 0 to {row.radon_degrees:g}°", frame=size[0]),
     ]
 
 
-def _draw(page: Page, panel: _Panel, left: int, top: int) -> None:
+def _draw_panel(page: Page, panel: _Panel, left: int, top: int) -> None:
+    """Draw a panel with its texts, cross ticks and scale bar, its frame's upper left corner at (left, top)."""
     x, y = left + (panel.frame - panel.width) // 2, top + (_SIDE - panel.height) // 2
     page.image(panel.picture, x, y, panel.width, panel.height)
     if panel.cross is not None:
-        across, down = panel.cross
-        tick = 12
+        (across, down), tick = panel.cross, 12
         if 0 <= down <= panel.height:
             for start in (x, x + panel.width - tick):
                 page.line([(start, y + down), (start + tick, y + down)], _CROSS, 1.2)
@@ -258,15 +273,17 @@ def _draw(page: Page, panel: _Panel, left: int, top: int) -> None:
     page.text(panel.below, left, top + _SIDE + 20, _TEXT, _FAINT)
 
 
-def _bright(values: Floats32) -> float:
-    """The number that gets the last colour."""
-    return max(float(np.quantile(values, _SHARE)) if values.size else 0.0, 1e-12)
+def _upper_limit(values: Floats32) -> float:
+    """Return the value that gets the last colour: the quantile `_QUANTILE` of the values."""
+    return max(float(np.quantile(values, _QUANTILE)) if values.size else 0.0, 1e-12)
 
 
-def _range(window: tuple[float, float], unit: str) -> str:
+def _range_text(window: tuple[float, float], unit: str) -> str:
+    """Return the text of a range of values, such as "0 to 12.3 counts"."""
     largest = f"{window[1]:.0f}" if window[1] >= 1000 else number(window[1], 3)
     return f"0 to {largest} {unit_text(unit)}".rstrip()
 
 
-def _listed(values: Floats) -> str:
+def _numbers_text(values: Floats) -> str:
+    """Return the text of numbers rounded to 0.1, with commas between."""
     return ", ".join(number(round(float(value), 1)) for value in values)

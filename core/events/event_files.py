@@ -1,4 +1,4 @@
-"""The file of one event: HDF5 that any reader opens, with a seal that says what every byte must be (`core/hdf5.py`)."""
+"""File of one event: HDF5 that any reader opens, behind a seal with checksums of all bytes (`core/hdf5.py`)."""
 
 import itertools
 import json
@@ -23,16 +23,16 @@ from .event_maker import EventArrays
 from .recipe import EventRecipe
 
 VERSION = 2
+"""Version of the file format."""
 _KIND = "mphDRR event"
-_COMPRESS_FROM = 1 << 13  # bytes: below, compressing costs more than it saves
-_BRICK = 32  # voxels along each axis of the truth's chunks, which are left out where they are empty
-_PIECE = 1 << 18  # numbers in a chunk of a list
-_PACKED: dict[str, Any] = {"compression": "gzip", "compression_opts": 1, "shuffle": True}
-
+_MIN_COMPRESSED = 1 << 13  # bytes of an array: compressing smaller ones costs more than it saves
+_BLOCK_SIDE = 32  # voxels along each axis of a chunk of the truth; chunks of zeros are not stored
+_LIST_CHUNK = 1 << 18  # numbers in a chunk of a one-dimensional dataset
+_COMPRESSION: dict[str, Any] = {"compression": "gzip", "compression_opts": 1, "shuffle": True}
 
 try:
     from zlib_ng.zlib_ng import decompress as inflate
-except ImportError:  # twice as fast, and nothing else
+except ImportError:  # zlib_ng is only faster, by a factor of two
     from zlib import decompress as inflate
 
 CONVENTIONS = (
@@ -46,33 +46,33 @@ CONVENTIONS = (
 )
 
 
-class Place(NamedTuple):
-    """Where the file of an event is: alone, or within another file."""
+class FileLocation(NamedTuple):
+    """Location of an event's file: a file of its own, or a range of bytes within a shard."""
 
-    path: str  # no Path, of which a hundred thousand take half a second
-    offset: int = 0
-    size: int | None = None  # bytes; None: as many as the file has
+    path: str  # path on the disk; text, since making a hundred thousand `Path` objects takes half a second
+    offset: int = 0  # first byte within that file
+    size: int | None = None  # bytes; None: up to the end of the file
 
 
 class Header(NamedTuple):
-    """What the text at the beginning of an event's file says."""
+    """Header of an event's file, from the seal at its beginning."""
 
-    event: int
-    recipe: str  # fingerprint
-    size: int  # bytes of the whole file
-    build: str = ""  # that made it (`version.build`); empty of sets of earlier versions
+    event: int  # number of the event
+    recipe: str  # fingerprint of the recipe
+    size: int  # bytes of the event's file
+    build: str = ""  # build of mphDRR that made the file (`version.build`); empty in files of version 0.1
 
 
-def header(place: Place) -> Header:
-    """The header of an event's file; `InputError` where the file is none, or is not as long as it says."""
-    path, offset, size = place
+def read_header(location: FileLocation) -> Header:
+    """Read the header of an event's file; `InputError` where it is no event, or has another size than the header states."""
+    path, offset, size = location
     try:
         with open(path, "rb", buffering=0) as file:
             size = os.fstat(file.fileno()).st_size if size is None else size
             if offset:
                 file.seek(offset)
             seal = hdf5.parse_seal(file.read(hdf5.HEADER))
-    except (OSError, InputError) as error:  # by hand, since sets have a hundred thousand
+    except (OSError, InputError) as error:  # not by `naming`, which is slow for a hundred thousand files
         raise InputError(f"{path}: {getattr(error, 'strerror', None) or error}") from None
     if seal is None or seal.kind != _KIND or "recipe" not in seal.fields:
         raise InputError(f"{path}: not an event of mphDRR")
@@ -81,21 +81,22 @@ def header(place: Place) -> Header:
     return Header(int(seal.fields.get("event", -1)), seal.fields["recipe"], size, seal.fields.get("build", ""))
 
 
-def verify(place: Place) -> Header:
-    """The header of an event's file, after every byte of the file was compared with it; `InputError` says what is wrong."""
-    found = header(place)
-    with naming(place.path):
-        hdf5.verify(place.path, place.offset)
-    return found
+def verify(location: FileLocation) -> Header:
+    """Check every byte of an event's file against its checksums and return its header; `InputError` names the damage."""
+    checked = read_header(location)
+    with naming(location.path):
+        hdf5.verify(location.path, location.offset)
+    return checked
 
 
-def packed(event: EventArrays, recipe: EventRecipe, geometry: dict[str, Any], threads: int | None = None) -> memoryview:
-    """The whole file of an event, the same bytes for the same event and versions.
+def pack(event: EventArrays, recipe: EventRecipe, geometry: dict[str, Any], threads: int | None = None) -> memoryview:
+    """Return the bytes of an event's file, which are the same for the same event and the same versions of all packages.
 
-    `geometry` holds small arrays by name, which go into the group ``geometry``.
+    `geometry` holds small arrays with their units, by name, for the group ``geometry``. `threads` compress the arrays, by
+    default one per core.
     """
     planned = event.planned
-    small = {
+    small_arrays = {
         "pose": (planned.pose, "mm"), "placement": (planned.placement, "mm"),
         "position": (np.array(planned.position), "mm"),
         "euler_angles": (np.deg2rad(planned.euler_degrees), "rad"),
@@ -105,6 +106,7 @@ def packed(event: EventArrays, recipe: EventRecipe, geometry: dict[str, Any], th
     }  # fmt: skip
 
     def fill(file: Any) -> None:
+        """Write all attributes and datasets of the event into an open HDF5 file."""
         file.attrs.update({
             "format": _KIND, "format_version": VERSION, "conventions": CONVENTIONS, "recipe_sha256": recipe.fingerprint,
             "event": planned.number, "phantom": planned.name, "split": planned.split or "",
@@ -113,69 +115,77 @@ def packed(event: EventArrays, recipe: EventRecipe, geometry: dict[str, Any], th
             "radon_over_degrees": 0.0 if recipe.radon is None else recipe.radon.degrees,
             "warnings": json.dumps(event.warnings), "versions": json.dumps(versions()),
         })  # fmt: skip
-        for name, (array, unit) in small.items():
+        for name, (array, unit) in small_arrays.items():
             file.create_dataset(name, data=array).attrs["unit"] = unit
         _write_truth(file, event.truth, recipe, pool)
-        named = [(f"images/{name}", images, event.units[name]) for name, images in event.images.items()]
-        named += [(f"radon/{count}", images, f"{event.truth.unit} mm") for count, images in event.radon.items()]
-        for name, images, unit in named:  # each image a chunk of its own, so that one reads alone
-            _write(file, name, images, recipe["storage.images"], (1, *images.shape[1:]), pool, {"unit": unit})
+        image_arrays = [(f"images/{name}", images, event.units[name]) for name, images in event.images.items()]
+        image_arrays += [(f"radon/{count}", images, f"{event.truth.unit} mm") for count, images in event.radon.items()]
+        for name, images, unit in image_arrays:  # a chunk for each image, so that one can be read alone
+            _write_dataset(file, name, images, recipe["storage.images"], (1, *images.shape[1:]), pool, {"unit": unit})
 
     with ThreadPoolExecutor(threads or cores()) as pool:
         return hdf5.pack(_KIND, {"event": str(planned.number), "recipe": recipe.fingerprint, "build": build()}, fill)
 
 
 def _write_truth(file: Any, truth: Volume, recipe: EventRecipe, pool: ThreadPoolExecutor) -> None:
-    """The truth: whole, in half precision, or the values that are not 0 and their places."""
-    array, store = truth.array, recipe["truth.store"]
-    attributes = {"unit": truth.unit, "quantity": truth.quantity}
-    if store != "sparse":
-        brick = tuple(min(n, _BRICK) for n in array.shape)
-        _write(file, "truth", array, store, brick, pool, attributes)
+    """Write the truth as the recipe stores it: in single or half precision, or only its values that are not 0."""
+    array, storage = truth.array, recipe["truth.store"]
+    attributes: dict[str, Any] = {"unit": truth.unit, "quantity": truth.quantity}
+    if storage != "sparse":
+        block_shape = tuple(min(n, _BLOCK_SIDE) for n in array.shape)
+        _write_dataset(file, "truth", array, storage, block_shape, pool, attributes)
         return
     flat = array.reshape(-1)
-    least = recipe["truth.below"] * float(np.abs(flat).max(initial=0.0))
-    kept = np.flatnonzero(np.abs(flat) > least) if least > 0 else np.flatnonzero(flat)
-    left = float(np.abs(np.delete(flat, kept)).max(initial=0.0)) if least > 0 else 0.0
-    index = kept.astype(np.uint32 if flat.size <= 1 << 32 else np.uint64)
-    chunk = (max(1, min(len(index), _PIECE)),)
-    _write(file, "truth_values", flat[kept], "float32", chunk, pool, attributes | {"error": left, "shape": array.shape})
-    _write(file, "truth_index", index, str(index.dtype), chunk, pool, {"unit": "1"})
+    threshold = recipe["truth.below"] * float(np.abs(flat).max(initial=0.0))
+    stored = np.flatnonzero(np.abs(flat) > threshold) if threshold > 0 else np.flatnonzero(flat)
+    error = float(np.abs(np.delete(flat, stored)).max(initial=0.0)) if threshold > 0 else 0.0
+    index = stored.astype(np.uint32 if flat.size <= 1 << 32 else np.uint64)
+    chunk = (max(1, min(len(index), _LIST_CHUNK)),)
+    attributes |= {"error": error, "shape": array.shape}
+    _write_dataset(file, "truth_values", flat[stored], "float32", chunk, pool, attributes)
+    _write_dataset(file, "truth_index", index, str(index.dtype), chunk, pool, {"unit": "1"})
 
 
-def _write(
-    file: Any, name: str, array: Array, store: str, chunk: tuple[int, ...], pool: ThreadPoolExecutor,
+def _write_dataset(
+    file: Any, name: str, array: Array, storage: str, chunk: tuple[int, ...], pool: ThreadPoolExecutor,
     attributes: dict[str, Any],
 ) -> None:  # fmt: skip
-    """A dataset, compressed in threads as HDF5 itself would do it in one: shuffled bytes, deflated; no chunk of zeros."""
-    if store == "float16":
-        array, more = _halved(array)
-        attributes = attributes | more
-    kind = np.dtype(array.dtype).newbyteorder("<")
-    if array.nbytes < _COMPRESS_FROM:
-        dataset = file.create_dataset(name, data=array.astype(kind, copy=False))
+    """Write an array as a dataset, compressed in threads as HDF5 itself would do it in one; skip chunks of zeros.
+
+    HDF5 shuffles a chunk (all first bytes of its numbers, then all second bytes, ...) and deflates it.
+    """
+    if storage == "float16":
+        array, scale_attributes = _to_half(array)
+        attributes = attributes | scale_attributes
+    dtype = np.dtype(array.dtype).newbyteorder("<")
+    if array.nbytes < _MIN_COMPRESSED:
+        dataset = file.create_dataset(name, data=array.astype(dtype, copy=False))
     else:
-        dataset = file.create_dataset(name, array.shape, kind, chunks=chunk, **_PACKED)
-        places = list(_places(array.shape, chunk))
+        dataset = file.create_dataset(name, array.shape, dtype, chunks=chunk, **_COMPRESSION)
+        corners = list(_chunk_corners(array.shape, chunk))
 
-        def deflated(place: tuple[int, ...]) -> bytes | None:
-            part = array[tuple(slice(i, i + m) for i, m in zip(place, chunk, strict=True))]
-            if not part.any():
+        def compress_chunk(corner: tuple[int, ...]) -> bytes | None:
+            """Return the stored bytes of the chunk that begins at `corner`; None where it holds only zeros."""
+            block = array[tuple(slice(i, i + m) for i, m in zip(corner, chunk, strict=True))]
+            if not block.any():
                 return None
-            whole = part if part.shape == chunk else np.zeros(chunk, array.dtype)
-            if whole is not part:  # chunks at the end are filled up
-                whole[tuple(map(slice, part.shape))] = part
-            octets = np.ascontiguousarray(whole, kind).view(np.uint8).reshape(-1, kind.itemsize)
-            return zlib.compress(octets.T.tobytes(), 1)
+            full_block = block if block.shape == chunk else np.zeros(chunk, array.dtype)
+            if full_block is not block:  # chunks at the array's end are padded with zeros
+                full_block[tuple(map(slice, block.shape))] = block
+            shuffled = np.ascontiguousarray(full_block, dtype).view(np.uint8).reshape(-1, dtype.itemsize)
+            return zlib.compress(shuffled.T.tobytes(), 1)
 
-        for place, data in zip(places, pool.map(deflated, places), strict=True):
+        for corner, data in zip(corners, pool.map(compress_chunk, corners), strict=True):
             if data is not None:
-                dataset.id.write_direct_chunk(place, data)
+                dataset.id.write_direct_chunk(corner, data)
     dataset.attrs.update(attributes)
 
 
-def _halved(array: Array) -> tuple[NDArray[np.float16], dict[str, float]]:
-    """An array in half precision, times a power of 2 that uses its range; the factor, and the largest error made."""
+def _to_half(array: Array) -> tuple[NDArray[np.float16], dict[str, float]]:
+    """Convert an array to half precision, scaled by a power of 2 to use its range.
+
+    Return the halves and the attributes "scale" (values = halves x scale) and "error", the largest absolute error.
+    """
     largest = float(np.abs(array).max(initial=0.0))
     scale = 2.0 ** (int(np.frexp(largest)[1]) - 15) if largest else 1.0
     halved = (array * np.float32(1 / scale)).astype(np.float16)
@@ -183,60 +193,60 @@ def _halved(array: Array) -> tuple[NDArray[np.float16], dict[str, float]]:
     return halved, {"scale": scale, "error": error}
 
 
-def read_array(file: Any, name: str, which: tuple[slice, ...] = (), out: Floats32 | None = None) -> Floats32:
-    """The numbers of a dataset in float32, or a part of them; into `out`, which holds zeros, where it is given.
+def read_array(file: Any, name: str, region: tuple[slice, ...] = (), out: Floats32 | None = None) -> Floats32:
+    """Read a dataset, or a region of it, as float32, into `out` where that is given: an array of zeros.
 
-    `which` are slices without steps, one for each axis or none.
+    `region` has a slice without step for each axis; an empty one stands for the whole dataset.
     """
     dataset = file[name]
-    which = which or (slice(None),) * len(dataset.shape)
-    bounds = [part.indices(n)[:2] for part, n in zip(which, dataset.shape, strict=True)]
+    region = region or (slice(None),) * len(dataset.shape)
+    bounds = [span.indices(n)[:2] for span, n in zip(region, dataset.shape, strict=True)]
     shape = tuple(max(0, stop - start) for start, stop in bounds)
     if out is None:
         out = np.zeros(shape, np.float32)
     scale = np.float32(dataset.attrs.get("scale", 1))
     if dataset.compression != "gzip" or not dataset.shuffle or dataset.dtype.kind != "f":
-        np.multiply(dataset[which], scale, out=out, casting="unsafe")
+        np.multiply(dataset[region], scale, out=out, casting="unsafe")
         return out
     chunk = dataset.chunks
-    for place in _places(dataset.shape, chunk, bounds):
-        if dataset.id.get_chunk_info_by_coord(place).byte_offset is None:  # of zeros
+    for corner in _chunk_corners(dataset.shape, chunk, bounds):
+        if dataset.id.get_chunk_info_by_coord(corner).byte_offset is None:  # a chunk of zeros is not stored
             continue
-        part = _inflated(dataset.id.read_direct_chunk(place)[1], dataset.dtype).reshape(chunk)
-        within = [(max(i, a), min(i + m, b)) for i, m, (a, b) in zip(place, chunk, bounds, strict=True)]
-        there = tuple(slice(a - i, b - i) for i, (a, b) in zip(place, within, strict=True))
-        here = tuple(slice(a - start, b - start) for (start, _), (a, b) in zip(bounds, within, strict=True))
-        np.multiply(part[there], scale, out=out[here], casting="unsafe")
+        block = _inflate_chunk(dataset.id.read_direct_chunk(corner)[1], dataset.dtype).reshape(chunk)
+        overlap = [(max(i, a), min(i + m, b)) for i, m, (a, b) in zip(corner, chunk, bounds, strict=True)]
+        source = tuple(slice(a - i, b - i) for i, (a, b) in zip(corner, overlap, strict=True))
+        target = tuple(slice(a - start, b - start) for (start, _), (a, b) in zip(bounds, overlap, strict=True))
+        np.multiply(block[source], scale, out=out[target], casting="unsafe")
     return out
 
 
-def _inflated(data: bytes, kind: np.dtype[Any]) -> Array:
-    """The numbers of a chunk, as HDF5 itself would read them, in a fourth of the time."""
-    planes = np.frombuffer(inflate(data), np.uint8).reshape(kind.itemsize, -1)
-    words = planes[-1].astype(f"<u{kind.itemsize}")
+def _inflate_chunk(data: bytes, dtype: np.dtype[Any]) -> Array:
+    """Return the numbers of a stored chunk, inflated and unshuffled as HDF5 does it, in a quarter of its time."""
+    planes = np.frombuffer(inflate(data), np.uint8).reshape(dtype.itemsize, -1)
+    bits = planes[-1].astype(f"<u{dtype.itemsize}")
     for plane in planes[-2::-1]:
-        words <<= 8
-        words |= plane
-    return words.view(kind)
+        bits <<= 8
+        bits |= plane
+    return bits.view(dtype)
 
 
-def _places(
+def _chunk_corners(
     shape: Sequence[int], chunk: Sequence[int], bounds: Sequence[tuple[int, int]] | None = None
 ) -> Iterator[tuple[int, ...]]:
-    """Where the chunks of an array begin, or those that have a part between `bounds`."""
+    """Return the first indices of the chunks of an array, or of those that reach into `bounds` (start, stop) per axis."""
     bounds = [(0, n) for n in shape] if bounds is None else bounds
     axes = [range(start // m * m, stop, m) for m, (start, stop) in zip(chunk, bounds, strict=True)]
     return itertools.product(*axes)
 
 
-def read_truth(file: Any, grid: Grid, which: tuple[slice, ...] = (), out: Floats32 | None = None) -> Floats32:
-    """The truth (n_x, n_y, n_z) of an open event's file, or a part of it, as `read_array` does."""
+def read_truth(file: Any, grid: Grid, region: tuple[slice, ...] = (), out: Floats32 | None = None) -> Floats32:
+    """Read the truth (n_x, n_y, n_z), or a region of it, from an open event's file; arguments as for `read_array`."""
     if "truth" in file:
-        return read_array(file, "truth", which, out)
+        return read_array(file, "truth", region, out)
     values = np.zeros(grid.n_voxels, np.float32)
     values[hdf5.read_numbers(file["truth_index"])] = hdf5.read_numbers(file["truth_values"])
-    found = values.reshape(grid.shape)[which]
+    region_values = values.reshape(grid.shape)[region]
     if out is None:
-        return found
-    out[...] = found
+        return region_values
+    out[...] = region_values
     return out

@@ -1,4 +1,4 @@
-"""The arrays of one event: truth, images of every model, Radon images."""
+"""Computation of one event's arrays: truth, images of every model, Radon images."""
 
 import math
 from dataclasses import dataclass
@@ -16,7 +16,7 @@ from ..geometry.views import Views
 from ..memory import readable_size, require
 from ..progress import Progress, tell
 from ..projector import Emission, Model, Projector
-from ..projector.backends import choose
+from ..rays.backends import choose
 from ..recording import Remembered, recorded_warnings, remembered
 from ..runs.projecting import Imaging, warn_of_energy
 from ..runs.recipe import Recipe
@@ -28,27 +28,36 @@ from ..volumes.volume import Volume
 from .planning import PlannedEvent, plan
 from .recipe import EventRecipe
 
-_KEPT_VOLUMES = 2
-_WORKER = 100 * 2**20  # bytes of a worker's Python and its libraries
+_CACHED_VOLUMES = 2
+"""Volumes from files that are kept in memory, since events may share them."""
+_WORKER_BYTES = 100 * 2**20
+"""Memory of a worker's Python with its libraries, bytes."""
 
 
 @dataclass(frozen=True, eq=False)
 class EventArrays:
-    """What an event's file holds besides its settings."""
+    """Computed arrays of an event with their units and warnings."""
 
     planned: PlannedEvent
+    """Drawn parameters of the event."""
     truth: Volume
-    images: dict[str, Floats32]  # by model, (M, n_v, n_u): expected means, background included
-    units: dict[str, str]  # by model
-    radon: dict[int, Floats32]  # by number of angles, (n, n_v, n_u), value x mm
-    gains: Floats  # (M,)
-    warnings: tuple[str, ...] = ()  # those of a run of the same settings
+    """True volume, from which all images are simulated."""
+    images: dict[str, Floats32]
+    """Images (M, n_v, n_u) by model: expected means, background included."""
+    units: dict[str, str]
+    """Units of the images, by model."""
+    radon: dict[int, Floats32]
+    """Parallel projections (n, n_v, n_u) by number of angles n, value x mm."""
+    gains: Floats
+    """Factors (M,) of the modules' sensitivities in images of counts."""
+    warnings: tuple[str, ...] = ()
+    """Warnings that a projection run with the same settings would give."""
 
 
 class EventMaker:
-    """Makes events of a recipe; what all of them share (scanner, rays) is made once.
+    """Maker of a recipe's events, which computes what they share (scanner, rays) once.
 
-    `threads` is how many a projection takes, by default one per core. The numbers do not depend on it.
+    `threads` is the number of threads of a projection, by default one per core; the images do not depend on it.
     """
 
     def __init__(self, recipe: EventRecipe, threads: int | None = None) -> None:
@@ -57,41 +66,41 @@ class EventMaker:
 
     @cached_property
     def system(self) -> Scanner:
-        """The scanner."""
+        """The scanner of all events."""
         return recipe_system(self.recipe.system, lambda name: self.recipe.input(name).path)
 
     @cached_property
     def views(self) -> Views:
-        """The views of the scanner's images."""
+        """The views of the images (M, n_v, n_u)."""
         return recipe_views(self.recipe.system, self.system)
 
     @property
     def raw_bytes(self) -> int:
-        """How large an event is before it is packed."""
+        """The bytes of an event's arrays as float32, uncompressed."""
         recipe = self.recipe
-        n = recipe.grid.n_voxels + len(recipe.models) * len(self.views) * math.prod(self.views.shape)
+        n_values = recipe.grid.n_voxels + len(recipe.models) * len(self.views) * math.prod(self.views.shape)
         if recipe.radon is not None:
-            n += sum(recipe.radon.counts) * math.prod(recipe.radon.shape)
-        return 4 * n
+            n_values += sum(recipe.radon.counts) * math.prod(recipe.radon.shape)
+        return 4 * n_values
 
     def require_memory(self, workers: int = 1) -> None:
-        """Raise `InputError` where so many events at once do not fit into memory, or the scanner cannot be read."""
-        what = f"an event of {readable_size(self.raw_bytes)}" if workers == 1 else f"{workers} workers"
-        require(workers * (2.5 * self.raw_bytes + (workers > 1) * _WORKER), what)
+        """Raise `InputError` where `workers` events at once exceed the memory, or the scanner cannot be read."""
+        purpose = f"an event of {readable_size(self.raw_bytes)}" if workers == 1 else f"{workers} workers"
+        require(workers * (2.5 * self.raw_bytes + (workers > 1) * _WORKER_BYTES), purpose)
 
     def make(self, number: int, progress: Progress | None = None) -> EventArrays:
-        """Compute an event; `progress` is called as ``progress(steps done, steps)`` and may raise `Cancelled`."""
+        """Compute event `number`; `progress` is called as ``progress(steps done, steps)`` and may raise `Cancelled`."""
         planned, recipe = plan(self.recipe, number), self.recipe
         self.require_memory()
-        done, steps = 0, 1 + len(recipe.models) + (0 if recipe.radon is None else len(recipe.radon.counts))
+        n_done, n_steps = 0, 1 + len(recipe.models) + (0 if recipe.radon is None else len(recipe.radon.counts))
 
         def step() -> None:
-            nonlocal done
-            done += 1
-            tell(progress, done, steps)
+            nonlocal n_done
+            n_done += 1
+            tell(progress, n_done, n_steps)
 
-        tell(progress, 0, steps)
-        _ = self.system, choose("auto")  # before the event, whose file does not hold warnings of scanner and machine
+        tell(progress, 0, n_steps)
+        _ = self.system, choose("auto")  # their warnings come before the event, whose file must not hold them
         with naming(f"event {number}"), recorded_warnings() as warnings:
             truth = self.truth(planned)
             step()
@@ -99,99 +108,100 @@ class EventMaker:
             images, units = {}, {}
             for name in recipe.models:
                 with naming(name):
-                    images[name], units[name] = self._images(name, planned, truth, gains)
+                    images[name], units[name] = self._model_images(name, planned, truth, gains)
                 step()
             radon = {}
-            for count, projector in self._radon.again().items():
+            for count, projector in self._radon_projectors.again().items():
                 radon[count] = projector(truth)
                 step()
         return EventArrays(planned, truth, images, units, radon, gains, tuple(dict.fromkeys(warnings)))
 
     def truth(self, planned: PlannedEvent) -> Volume:
-        """The event's volume."""
+        """Return the event's truth: the drawn phantom on the recipe's grid, times the factor of activity."""
         planned.made_phantom.again()
-        factor = planned.activity_factor
-        volume = self._voxels(planned, self.recipe.quantity)
-        if factor == 1.0:
+        volume = self._voxelize(planned, self.recipe.quantity)
+        if planned.activity_factor == 1.0:
             return volume
-        return Volume(freeze(volume.array * np.float32(factor)), volume.grid, volume.quantity)
+        return Volume(freeze(volume.array * np.float32(planned.activity_factor)), volume.grid, volume.quantity)
 
-    def _voxels(self, planned: PlannedEvent, quantity: str) -> Volume:
-        """The mean of the event's phantoms, or its file's volume, on the grid of the truth."""
+    def _voxelize(self, planned: PlannedEvent, quantity: str) -> Volume:
+        """Return the mean of the event's phantoms, or the volume of its file, on the grid of the truth."""
         grid, placement = self.recipe.grid, planned.placement
         if planned.entry.is_volume:
             file = planned.file if quantity == self.recipe.quantity else planned.mu_file
             assert file is not None  # the recipe refuses attenuation by a volume without a mu_file
-            volume = self._read(file)
-            if planned.entry["center"] and planned.file is not None:  # what attenuates moves as far as the activity
-                volume = centered(volume, volume.grid.center - self._read(planned.file).grid.center)
-            return _placed(volume, placement, grid)
+            volume = self._read_volume(file)
+            if planned.entry["center"] and planned.file is not None:  # the attenuation moves as far as the activity
+                volume = centered(volume, volume.grid.center - self._read_volume(planned.file).grid.center)
+            return _resample_placed(volume, placement, grid)
         volumes = [phantom.voxelize(grid, placement, quantity=quantity) for phantom in planned.phantoms]
         if len(volumes) == 1:
             return volumes[0]
         mean = sum(volume.array.astype(np.float64) for volume in volumes) / len(volumes)
         return Volume(freeze(np.asarray(mean, np.float32)), grid, quantity)
 
-    def _read(self, file: str) -> Volume:
-        """A file's volume; the last few are kept, since events may share them."""
+    def _read_volume(self, file: str) -> Volume:
+        """Return the volume in a file that the recipe names, from memory where it is one of the last `_CACHED_VOLUMES`."""
         if file not in self._volumes:
-            while len(self._volumes) >= _KEPT_VOLUMES:
+            while len(self._volumes) >= _CACHED_VOLUMES:
                 del self._volumes[next(iter(self._volumes))]
             self._volumes[file] = remembered(self.recipe.input(file).volume)
         return self._volumes[file].again()
 
-    def _images(self, name: str, planned: PlannedEvent, truth: Volume, gains: Floats) -> tuple[Floats32, str]:
-        """A model's images, and their unit."""
-        recipe, imaging, mu = self.recipe.models[name], self._imaging[name].again(), None
+    def _model_images(self, name: str, planned: PlannedEvent, truth: Volume, gains: Floats) -> tuple[Floats32, str]:
+        """Return the expected images (M, n_v, n_u) of the truth by a model, and their unit."""
+        recipe, imaging, mu = self.recipe.models[name], self._imagings[name].again(), None
         if recipe["attenuation.of_phantom"]:
             self._check_mu(planned, imaging.model)
-            mu = self._voxels(planned, "mu").array
+            mu = self._voxelize(planned, "mu").array
         images = imaging.images(truth, mu)
         if isinstance(imaging.model, Emission) and self.recipe["augmentation.module_gain"]:
             images *= gains.astype(np.float32)[:, None, None]
         return images, imaging.unit(truth)
 
     def _check_mu(self, planned: PlannedEvent, model: Model) -> None:
-        """Raise `InputError` where nothing attenuates; warn where it holds at another energy than the model's."""
+        """Raise `InputError` where the phantom has no attenuation; warn where mu is for another energy than the model's."""
         if planned.phantom is not None:
             require_mu(planned.phantom, model)
         elif planned.mu_file is not None:
             warn_of_energy(model, planned.entry["energy"], Path(planned.mu_file).name)
 
     @cached_property
-    def _imaging(self) -> dict[str, Remembered[Imaging]]:
-        """What makes each model's images."""
-        found = {}
+    def _imagings(self) -> dict[str, Remembered[Imaging]]:
+        """The simulators of each model's images, by model, with the warnings that their construction gave."""
+        imagings = {}
         for name, recipe in self.recipe.models.items():
             with naming(f"models.{name}"):
-                found[name] = remembered(partial(self._imaging_of, recipe))
-        return found
+                imagings[name] = remembered(partial(self._make_imaging, recipe))
+        return imagings
 
-    def _imaging_of(self, recipe: Recipe) -> Imaging:
+    def _make_imaging(self, recipe: Recipe) -> Imaging:
+        """Return the image simulator of a model's recipe on the grid of the truth."""
         grid, placed = self.recipe.grid, self.recipe.placed(recipe)
         mu = mu_of_files(recipe, recipe_model(placed, self.system), lambda file: self.recipe.input(file).volume())
-        if recipe["attenuation.of_phantom"]:  # each event has its own: here, to say on which grid
+        if recipe["attenuation.of_phantom"]:  # a placeholder for the grid: each event has its own mu
             mu = Volume(freeze(np.zeros(grid.shape, np.float32)), grid, "mu")
         return recipe_imaging(placed, self.system, self.views, grid, mu, threads=self.threads)
 
     @cached_property
-    def _radon(self) -> Remembered[dict[int, Projector]]:
+    def _radon_projectors(self) -> Remembered[dict[int, Projector]]:
+        """The projectors of the Radon images by number of angles, with the warnings that their construction gave."""
         recipe, counts = self.recipe, () if self.recipe.radon is None else self.recipe.radon.counts
         projector = partial(Projector, recipe.grid, threads=self.threads)
         return remembered(lambda: {n: projector(radon_views(recipe, n)) for n in counts})
 
 
 def radon_views(recipe: EventRecipe, count: int) -> Views:
-    """The parallel views of a recipe with so many angles."""
+    """Return the parallel views of a recipe's Radon images at `count` angles; `InputError` where it has none."""
     if recipe.radon is None or count not in recipe.radon.counts:
-        known = () if recipe.radon is None else recipe.radon.counts
-        raise InputError(f"radon: no images of {count} angles; there are {', '.join(map(str, known)) or 'none'}")
+        counts = () if recipe.radon is None else recipe.radon.counts
+        raise InputError(f"radon: expected a number of angles of {', '.join(map(str, counts)) or 'none'}, got {count}")
     angles = math.radians(recipe.radon.degrees) / count * np.arange(count)
     return parallel_views(angles, recipe.radon.shape, recipe.radon.pitch, center=recipe.grid.center)
 
 
-def _placed(volume: Volume, placement: Array, grid: Grid) -> Volume:
-    """A file's volume, moved by a placement, on a grid: interpolated, or where the voxels are coarser, their means."""
+def _resample_placed(volume: Volume, placement: Array, grid: Grid) -> Volume:
+    """Resample a volume, moved by a placement (4, 4), onto a grid: by interpolation, or by means onto coarser voxels."""
     moved = Volume(volume.array, Grid(volume.grid.shape, placement @ volume.grid.affine), volume.quantity)
     coarser = bool(np.any(grid.spacing > 1.5 * moved.grid.spacing.max()))
     return resample(moved, grid, "mean" if coarser else "linear")

@@ -1,4 +1,4 @@
-"""Reading event sets: events as numpy arrays, by number or by what the index says."""
+"""Access to event sets: events as NumPy arrays, by number or by their rows of the index."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from ..runs.run_recipe import recipe_model, with_phantom
 from ..validation import freeze, positive
 from ..volumes.images import Images
 from ..volumes.volume import Volume
-from .event_files import Place, read_array, read_truth
+from .event_files import FileLocation, read_array, read_truth
 from .event_maker import radon_views
 from .folders import SetFolder
 from .index import column
@@ -38,18 +38,18 @@ COUNTED = ("counts", "photons")
 """Units of images that have Poisson noise."""
 
 
-def _numbers(name: str, text: str) -> Any:
-    """A property of `Event`: an array of its file, with its docstring."""
+def _stored_array(name: str, description: str) -> Any:
+    """Return a property of `Event` that reads an array of its file, float64, with this description as docstring."""
 
     def read(event: Event) -> Floats:
         with event.opened() as file:
             return np.asarray(hdf5.read_numbers(event._dataset(file, name)), np.float64)
 
-    return property(read, doc=text)
+    return property(read, doc=description)
 
 
 class Event:
-    """One event of a set. Each access opens its file, reads what is asked for, and closes it."""
+    """Event of a set; each access opens the event's file, reads one item and closes the file."""
 
     def __init__(self, folder: SetFolder, number: int) -> None:
         self._folder, self.number = folder, number
@@ -57,87 +57,88 @@ class Event:
 
     @contextmanager
     def opened(self) -> Iterator[Any]:
-        """Its file, an ``h5py.File``, whose bytes are checked as they are read; `InputError` where it is damaged."""
+        """Open the event's file as an ``h5py.File`` that checks bytes as they are read; `InputError` where it is damaged."""
         if self._file is not None:
             yield self._file
             return
-        if not self.path.exists():
-            vars(self._folder).pop("places", None)
-        with hdf5.opened(self.path, self._place.offset) as file:
+        if not self.path.exists():  # the set may have been packed or unpacked meanwhile
+            vars(self._folder).pop("locations", None)
+        with hdf5.opened(self.path, self._location.offset) as file:
             if file.attrs["event"] != self.number or file.attrs["recipe_sha256"] != self.recipe.fingerprint:
                 raise InputError("an event of another number or recipe")
             yield file
 
     @contextmanager
     def held(self) -> Iterator[Event]:
-        """The same event with its file open, for several readings in one thread."""
-        held = Event(self._folder, self.number)
-        with self.opened() as held._file:
-            yield held
+        """Open the event's file and yield an event that reads from it, for several readings in one thread."""
+        event = Event(self._folder, self.number)
+        with self.opened() as event._file:
+            yield event
 
     @property
-    def _place(self) -> Place:
-        return self._folder.places.get(self.number) or Place(str(self._folder.store.event_path(self.number)))
+    def _location(self) -> FileLocation:
+        """The location of the event's file; that of a file of its own where there is none yet."""
+        return self._folder.locations.get(self.number) or FileLocation(str(self._folder.store.event_path(self.number)))
 
     @property
     def recipe(self) -> EventRecipe:
-        """The recipe of its set."""
+        """The recipe of the event's set."""
         return self._folder.recipe
 
     @property
     def path(self) -> Path:
-        """Its file, or the shard that it is in."""
-        return Path(self._place.path)
+        """The path of the event's file, or of the shard that holds it."""
+        return Path(self._location.path)
 
     @property
     def row(self) -> dict[str, Any]:
-        """Its row of the index, by column."""
+        """The event's row of the index, by column."""
         return self._folder.index.values(self._folder.line(self.number))
 
     @cached_property
     def attributes(self) -> dict[str, Any]:
-        """The attributes of its file."""
+        """The attributes of the event's file."""
         with self.opened() as file:
             return hdf5.attributes(file)
 
     @property
     def name(self) -> str:
-        """The phantom's name in the recipe."""
+        """The name of the phantom in the recipe."""
         return str(self.attributes["phantom"])
 
     @property
     def split(self) -> str | None:
-        """Such as "train"; None where the recipe has no splits."""
+        """The split of the event, such as "train"; None where the recipe has no splits."""
         return self.attributes["split"] or None
 
     @property
     def settings(self) -> dict[str, Any]:
-        """All settings of the phantom, or the names of its files."""
+        """All settings of the phantom by their names in recipes, or the names of its files."""
         return json.loads(self.attributes["settings"])
 
     @property
     def noise_seed(self) -> int:
-        """The event's own seed of noise."""
+        """The seed of the event's own noise."""
         return int(self.attributes["noise_seed"])
 
     @property
     def planned(self) -> PlannedEvent:
-        """How it was drawn, with its phantom."""
+        """The drawn parameters of the event, with its phantom."""
         return plan(self._folder.recipe, self.number)
 
-    pose: Floats = _numbers("pose", "World-from-phantom pose (4, 4), mm: rotation and translation.")
-    placement: Floats = _numbers("placement", "The pose with mirroring and the factor of size, (4, 4), mm.")
-    position: Floats = _numbers("position", "Position of the phantom, (3,), mm.")
-    euler_degrees: Floats = _numbers("euler_degrees", "phi, theta, psi of the phantom, (3,), degrees.")
-    module_gain: Floats = _numbers("module_gain", "Factors (M,) of the modules' sensitivities in images of counts.")
+    pose: Floats = _stored_array("pose", "The pose (4, 4), world from phantom, mm: rotation and translation.")
+    placement: Floats = _stored_array("placement", "The pose (4, 4) with mirroring and the factor of size, mm.")
+    position: Floats = _stored_array("position", "The position of the phantom's centre, (3,), mm.")
+    euler_degrees: Floats = _stored_array("euler_degrees", "The angles phi, theta, psi of the phantom, (3,), degrees.")
+    module_gain: Floats = _stored_array("module_gain", "The sensitivity factors (M,) of the modules, for counts.")
 
     @property
     def truth(self) -> Volume:
-        """The volume of which all images are."""
+        """The true volume, from which all images were simulated."""
         return Volume(freeze(self.truth_part()), self.recipe.grid, self.recipe.quantity)
 
     def truth_part(self, part: tuple[slice, ...] = (), out: Floats32 | None = None) -> Floats32:
-        """The numbers of the truth, or of a part of it, of which alone the bytes are read; into `out`, zeros, if given."""
+        """Read the values of the truth, or a part of them (a slice per axis), into `out`, an array of zeros, if given."""
         grid = self.recipe.grid
         with self.opened() as file:
             if "truth" in file:
@@ -146,24 +147,24 @@ class Event:
 
     @property
     def views(self) -> Views:
-        """The views of its images."""
+        """The views of the images (M, n_v, n_u)."""
         return self._folder.maker.views
 
     @property
     def system(self) -> Scanner:
-        """The scanner."""
+        """The scanner of the set."""
         return self._folder.maker.system
 
     @property
     def models(self) -> list[str]:
-        """The names of the models that it has images of."""
+        """The names of the models whose images the event has."""
         with self.opened() as file:
             return list(file.get("images", ()))
 
     def unit(self, model: str) -> str:
-        """The unit of a model's images, such as "counts"."""
+        """Return the unit of a model's images, such as "counts"."""
         with self.opened() as file:
-            return str(self._images(file, model).attrs["unit"])
+            return str(self._image_dataset(file, model).attrs["unit"])
 
     def images(
         self,
@@ -173,135 +174,134 @@ class Event:
         modules: Any = slice(None),
         out: Floats32 | None = None,
     ) -> Floats32:
-        """A model's images.
+        """Read a model's images.
 
         Parameters
         ----------
         model
-            Its name in the recipe.
+            Name of the model in the recipe.
         noise_seed
-            Draws Poisson counts (`sample_counts`), the same each time; `noise_seed` of the event is its own. None: the
-            expected means.
+            Seed of Poisson counts (`sample_counts`), such as the event's own `Event.noise_seed`. None: expected means.
         level
-            Share of the acquisition time; only of counts and photons.
+            Fraction of the acquisition time; only for counts and photons.
         modules
-            Which of them: an index, a slice or a list of indices. Their noise does not depend on the others.
+            Modules whose images are returned: an index, a slice or a list of indices. Noise does not depend on the choice.
         out
-            Zeros, (M, n_v, n_u) float32, which the images of all modules are written to.
+            Array of zeros (M, n_v, n_u), float32, into which the images of all modules are written.
 
         Returns
         -------
         array (M, n_v, n_u), float32
-            In the unit of `unit`; column index along +u, row index along +v. Of one index, (n_v, n_u).
+            Images in the unit that `unit` returns; column index along +u, row index along +v. For one index, (n_v, n_u).
 
         Raises
         ------
         InputError
-            No such model, or noise or a level of images that are no counts.
+            There is no such model, or noise or a level was asked for but the images are no counts.
         """
         level = positive(level, "level")
         with self.opened() as file:
-            dataset = self._images(file, model)
+            dataset = self._image_dataset(file, model)
             if (noise_seed is not None or level != 1.0) and dataset.attrs["unit"] not in COUNTED:
                 unit = dataset.attrs["unit"]
                 raise InputError(f"{model}: only counts and photons have noise and levels, its images are {unit}")
-            one = isinstance(modules, slice) and modules.step in (None, 1)
-            part = (modules, slice(None), slice(None)) if one and noise_seed is None else ()
-            images = read_array(file, dataset.name, part, out)
+            is_range = isinstance(modules, slice) and modules.step in (None, 1)
+            region = (modules, slice(None), slice(None)) if is_range and noise_seed is None else ()
+            images = read_array(file, dataset.name, region, out)
         if level != 1.0:
             images *= np.float32(level)
         if noise_seed is not None:
             draw_counts(images, noise_seed, images)
-        return images if part else images[modules]
+        return images if region else images[modules]
 
     def radon(self, count: int) -> Floats32:
-        """The parallel projections (count, n_v, n_u) at so many angles, value x mm."""
+        """Read the parallel projections (count, n_v, n_u) of the truth at `count` angles, value x mm."""
         with self.opened() as file:
             shape = None if self.recipe.radon is None else (count, *self.recipe.radon.shape)
-            return Images.of(read_array(file, self._dataset(file, f"radon/{count}", shape).name), self.recipe.quantity)
+            return Images.tag(read_array(file, self._dataset(file, f"radon/{count}", shape).name), self.recipe.quantity)
 
     def radon_views(self, count: int) -> Views:
-        """The views of the parallel projections."""
+        """Return the views of the parallel projections at `count` angles."""
         return radon_views(self._folder.recipe, count)
 
     def run(self, model: str, noise_seed: int | None = None, level: float = 1.0) -> ProjectionRun:
-        """The images of a model as a projection run, with truth, scanner and recipe: to show, write or reconstruct.
+        """Return the images of a model as a projection run with truth, scanner and recipe, to show, write or reconstruct.
 
-        `level` is the share of the decays, and of the background, that are counted; the recipe's time is shortened to it.
-        The recipe is left out where what attenuates is a phantom that no recipe of projections describes: with a factor of
-        its activity, the mean of several gates, or a volume.
+        `level` is the detected fraction of the decays and of the background; the recipe's acquisition time is shortened
+        accordingly. The run has no recipe where attenuation comes from a phantom that no recipe of projections describes:
+        one with a factor of activity, the mean of several gates, or a volume.
         """
         models = self._folder.recipe.models
         if model not in models:
             raise InputError(f"{model!r}: no such model; there are {', '.join(models) or 'none'}")
         settings: dict[str, Any] = {"model": model, "event": self.number, "volume": self.name}
         recipe = models[model] if level == 1.0 else _at_level(models[model], positive(level, "level"))
-        record = self._record(recipe)
+        record = self._run_recipe(recipe)
         if record is not None:
             settings["recipe"] = record.tables()
-        made: Any = recipe_model(self._folder.recipe.placed(recipe), self.system)
+        image_model: Any = recipe_model(self._folder.recipe.placed(recipe), self.system)
         images = self.images(model, noise_seed, level)
-        background = scaled(made.background, live_shares_of(recipe, images))
+        background = scaled(image_model.background, live_shares_of(recipe, images))
         return ProjectionRun(
             images, self.system, self.views, self.truth, unit=self.unit(model), settings=settings, seed=noise_seed,
-            background=background, efficiency=made.efficiency,
+            background=background, efficiency=image_model.efficiency,
         )  # fmt: skip
 
-    def _record(self, model: Recipe) -> Recipe | None:
-        """The recipe of a run of a model's images; None where none can say what attenuates."""
-        planned, recipe = self.planned, self._folder.recipe
+    def _run_recipe(self, model: Recipe) -> Recipe | None:
+        """Return the recipe of a run with a model's images; None where no recipe can describe the attenuation."""
+        planned, recipe, grid = self.planned, self.recipe, self.recipe.grid
         files = {key: model[key] for key in ("system.file", "system.columns")}
         changes: dict[str, Any] = {key: str(recipe.input(name).path) for key, name in files.items() if name is not None}
-        if (of_mu := model["attenuation.file"]) is not None:
-            changes["attenuation.file"] = [str(recipe.input(name).path) for name in of_mu]
+        if (mu_files := model["attenuation.file"]) is not None:
+            changes["attenuation.file"] = [str(recipe.input(name).path) for name in mu_files]
             if model["attenuation.energy"] != LINES:
-                changes |= {"attenuation.energy": None}  # the set's copy holds mu
+                changes |= {"attenuation.energy": None}  # the set's copy holds mu, not CT numbers
         record = recorded_recipe(recipe.placed(model.updated(changes)))
         if planned.phantom is not None and planned.entry["gates"] == 1 and planned.activity_factor == 1:
-            own: dict[str, Any] = {"phantom.voxels": recipe.grid.shape, "phantom.spacing": recipe.grid.spacing.tolist()}
+            values: dict[str, Any] = {"phantom.voxels": grid.shape, "phantom.spacing": grid.spacing.tolist()}
             if planned.file is not None:
-                own["phantom.file"] = str(recipe.input(planned.file).path)
-            return with_phantom(record.updated(own), planned.phantom, planned.placement)
+                values["phantom.file"] = str(recipe.input(planned.file).path)
+            return with_phantom(record.updated(values), planned.phantom, planned.placement)
         return None if model["attenuation.of_phantom"] else record
 
     def __repr__(self) -> str:
         return f"Event({self.number}, {self.path})"
 
-    def _images(self, file: Any, model: str) -> Any:
-        """The dataset of a model's images."""
+    def _image_dataset(self, file: Any, model: str) -> Any:
+        """Return the dataset of a model's images in an open file; `InputError` where it has another shape than the views."""
         return self._dataset(file, f"images/{model}", (len(self.views), *self.views.shape))
 
     def _dataset(self, file: Any, name: str, shape: tuple[int, ...] | None = None) -> Any:
-        """A dataset of the file, of the shape that the recipe says."""
+        """Return a dataset of an open file; `InputError` where it is missing, or its shape is not `shape`."""
         group, _, last = name.rpartition("/")
-        there = file.get(group, {}) if group else file
-        if last not in there:
-            raise InputError(f"no {group or 'array'} of {last!r}; there are {', '.join(there) or 'none'}")
+        members = file.get(group, {}) if group else file
+        if last not in members:
+            raise InputError(f"no {group or 'array'} of {last!r}; there are {', '.join(members) or 'none'}")
         if shape is not None and file[name].shape != shape:
-            raise InputError(f"{name} of shape {file[name].shape}, the recipe says {shape}")
+            raise InputError(f"{name}: expected the shape {shape}, got {file[name].shape}")
         return file[name]
 
 
 def _at_level(recipe: Recipe, level: float) -> Recipe:
-    """The recipe of a model whose images are a share of the counts of another's."""
+    """Return a model's recipe with time, photons and background scaled to a fraction `level` of the counts."""
     changes: dict[str, Any] = {key: level * recipe[key] for key in ("model.photons", "model.background") if recipe[key]}
     if recipe["model.kind"] == "emission":
         times, name = np.atleast_1d(recipe["model.time"]).tolist(), recipe["model.isotope"]
-        known = None if name is None else isotope(name)
-        changes["model.time"] = [known.duration(level, time) if known else level * time for time in times]
+        nuclide = None if name is None else isotope(name)
+        changes["model.time"] = [nuclide.duration(level, time) if nuclide else level * time for time in times]
     return recipe.updated(changes)
 
 
 class EventSet:
     """The events of one folder, or of several joined (``a + b``), in order of their numbers.
 
-    It holds no open file and reads nothing before it is asked for: it can be pickled, and used in threads and in processes
-    that fork or spawn.
+    A set holds no open file and reads on access: it can be pickled, and used in threads and in processes that fork or
+    spawn.
 
     Parameters
     ----------
     folder
-        The set's.
+        Folder of the set.
 
     Raises
     ------
@@ -318,15 +318,16 @@ class EventSet:
     """
 
     def __init__(self, folder: AnyPath) -> None:
-        found = SetFolder(folder)
-        _ = found.recipe  # which every set has
-        self._events = [Event(found, number) for number in found.places]
+        set_folder = SetFolder(folder)
+        _ = set_folder.recipe  # raises InputError where the folder is no set
+        self._events = [Event(set_folder, number) for number in set_folder.locations]
 
     @classmethod
-    def _of(cls, events: list[Event]) -> EventSet:
-        made = cls.__new__(cls)
-        made._events = events
-        return made
+    def _from_events(cls, events: list[Event]) -> EventSet:
+        """Return a set of these events, which may belong to several folders."""
+        event_set = cls.__new__(cls)
+        event_set._events = events
+        return event_set
 
     def __len__(self) -> int:
         return len(self._events)
@@ -342,14 +343,14 @@ class EventSet:
     else:
 
         def __getitem__(self, index: Any) -> Any:
-            found = self._events[index]
-            return self._of(found) if isinstance(index, slice) else found
+            selected = self._events[index]
+            return self._from_events(selected) if isinstance(index, slice) else selected
 
     def __iter__(self) -> Iterator[Event]:
         return iter(self._events)
 
     def __add__(self, other: EventSet) -> EventSet:
-        return self._of([*self._events, *other._events])
+        return self._from_events([*self._events, *other._events])
 
     @property
     def numbers(self) -> list[int]:
@@ -364,30 +365,31 @@ class EventSet:
     @property
     def recipe(self) -> EventRecipe:
         """The recipe of the first event's set."""
-        return self._first.recipe
+        return self._first_folder.recipe
 
     @property
     def system(self) -> Scanner:
         """The scanner of the first event's set."""
-        return self._first.maker.system
+        return self._first_folder.maker.system
 
     def where(self, holds: Callable[[Mapping[str, Any]], bool]) -> EventSet:
-        """The events whose row of the index a function takes."""
-        return self._of([event for event in self._events if holds(event.row)])
+        """Return the events for whose row of the index `holds(row)` is true."""
+        return self._from_events([event for event in self._events if holds(event.row)])
 
     def split(self, name: str) -> EventSet:
-        """The events of a split, such as "train"; `InputError` where the recipe has no such split."""
+        """Return the events of a split, such as "train"; `InputError` where the recipe has no such split."""
         splits = [column(event._folder.line(event.number), 2) for event in self._events]
-        known = set(splits) - {""} | (set(self.recipe.splits) if self._events else set())
-        if name not in known:
-            raise InputError(f"split {name!r}: there are {', '.join(sorted(known)) or 'none'}")
-        return self._of([event for event, split in zip(self._events, splits, strict=True) if split == name])
+        names = set(splits) - {""} | (set(self.recipe.splits) if self._events else set())
+        if name not in names:
+            raise InputError(f"split {name!r}: there are {', '.join(sorted(names)) or 'none'}")
+        return self._from_events([event for event, split in zip(self._events, splits, strict=True) if split == name])
 
     def __repr__(self) -> str:
         return f"EventSet({len(self)} events)"
 
     @property
-    def _first(self) -> SetFolder:
+    def _first_folder(self) -> SetFolder:
+        """The folder of the first event; `InputError` in an empty set."""
         if not self._events:
             raise InputError("the event set holds no events")
         return self._events[0]._folder

@@ -1,4 +1,4 @@
-"""The arrays that every event of a set has, by the names that exports and training call them."""
+"""Shapes of the arrays of an event, by their names in exports and training."""
 
 import math
 from collections.abc import Iterable
@@ -10,26 +10,26 @@ Shapes = dict[str, tuple[int, ...]]
 
 
 def field_shapes(events: EventSet) -> Shapes:
-    """The shapes of "truth", of each model's images by its name, and of "radon96" for each number of angles.
+    """Return the shapes of an event's arrays: "truth", images by model name, and "radon96" for 96 angles and so on.
 
-    `InputError` for no events, and for joined sets whose arrays are not of the same shapes.
+    `InputError` where there are no events, or where joined sets have arrays of different shapes.
     """
     if not len(events):
         raise InputError("the set has no events; make some, or choose another split")
-    found: Shapes = {}
+    common: Shapes = {}
     for event in {id(event.recipe): event for event in events}.values():
         recipe, shapes = event.recipe, Shapes()
         shapes["truth"] = recipe.grid.shape
         shapes |= {model: (len(event.views), *event.views.shape) for model in recipe.models}
         if recipe.radon is not None:
             shapes |= {f"radon{n}": (n, *recipe.radon.shape) for n in recipe.radon.counts}
-        if found and shapes != found:
-            differing = sorted(name for name in found | shapes if found.get(name) != shapes.get(name))
-            raise InputError(f"joined sets: expected events of the same arrays, but {', '.join(differing)} differ")
-        found = shapes
-    return found
+        if common and shapes != common:
+            differing = sorted(name for name in common | shapes if common.get(name) != shapes.get(name))
+            raise InputError(f"joined sets: expected arrays of the same shapes, but {', '.join(differing)} differ")
+        common = shapes
+    return common
 
 
 def float32_bytes(shapes: Iterable[tuple[int, ...]]) -> int:
-    """Bytes of arrays of float32 of these shapes."""
+    """Return the bytes that float32 arrays of these shapes take together."""
     return 4 * sum(map(math.prod, shapes))

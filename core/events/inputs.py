@@ -1,4 +1,4 @@
-"""The files that a recipe names: read once, kept as copies in the set, known by what they hold."""
+"""Files that a recipe names: read once, copied into the set, and identified by the SHA-256 of their content."""
 
 import hashlib
 import os
@@ -16,64 +16,71 @@ from ..volumes.volume_files import read_volume, read_volume_of, write_volume
 
 @dataclass(frozen=True)
 class Input:
-    """A file that the recipe names, or a set's copy of it."""
+    """A file that a recipe names, or a set's copy of it."""
 
     path: Path
-    what: str  # "copy" for a file as it is; of a volume its quantity, "activity", "mu" or "mu at 60" (from CT numbers)
-    sha256: str  # of a file's bytes; of a volume's numbers, places and quantity
+    """Path of the file, or of a folder of DICOM files."""
+    content: str
+    """Way to read it: "copy" for plain bytes; for a volume its quantity, "activity", "mu", or "mu at 60" for CT numbers
+    converted at 60 keV."""
+    sha256: str
+    """SHA-256 of a plain file's bytes, or of a volume's values, affine and quantity."""
     is_copy: bool = False
+    """Whether the file is the set's copy."""
 
     def volume(self) -> Volume:
-        """The volume in it."""
-        return read_volume(self.path) if self.is_copy else _volume(self.path, self.what)
+        """Return the volume in the file."""
+        return read_volume(self.path) if self.is_copy else _read_original(self.path, self.content)
 
     def copy_to(self, folder: Path) -> "Input":
-        """A copy in a folder: of a file its bytes, of a volume, which may be a folder of DICOM files, an HDF5 file."""
-        stem, ending = (self.path.stem, self.path.suffix) if self.what == "copy" else (_stem(self.path), ".h5")
+        """Copy into a folder and return the copy: the same bytes of a plain file, an HDF5 file of a volume."""
+        stem, ending = (self.path.stem, self.path.suffix) if self.content == "copy" else (_stem(self.path), ".h5")
         target, number = folder / f"{stem}{ending}", 1
         while target.exists():
-            if _hash(target, self.what, True) == self.sha256:  # another shard was faster
-                return Input(target, self.what, self.sha256, True)
+            if _sha256(target, self.content, True) == self.sha256:  # another process has copied it meanwhile
+                return Input(target, self.content, self.sha256, True)
             number += 1
             target = folder / f"{stem}-{number}{ending}"
-        if self.what == "copy":
+        if self.content == "copy":
             write_bytes(target, self.path.read_bytes())
         else:
             write_volume(self.volume(), target)
-        return Input(target, self.what, self.sha256, True)
+        return Input(target, self.content, self.sha256, True)
 
     def current_sha256(self) -> str:
-        """What `sha256` is of the file as it is now; `InputError` where it cannot be read."""
-        return _hash(self.path, self.what, self.is_copy)
+        """Return the SHA-256 of the file's present content, as in `sha256`; `InputError` where it cannot be read."""
+        return _sha256(self.path, self.content, self.is_copy)
 
 
-def original_input(name: str, folder: Path, what: str) -> Input:
-    """A file by its name in a recipe, relative to a folder."""
+def original_input(name: str, folder: Path, content: str) -> Input:
+    """Return the file of a name in a recipe, relative to the recipe's folder; `InputError` where there is none."""
     path = Path(os.path.normpath(folder / name))
     if not path.exists():
         raise InputError(f"{path}: no such file")
-    return Input(path, what, _hash(path, what, False))
+    return Input(path, content, _sha256(path, content, False))
 
 
-def _hash(path: Path, what: str, is_copy: bool) -> str:
-    if what == "copy":
+def _sha256(path: Path, content: str, is_copy: bool) -> str:
+    """Return the SHA-256 of a plain file's bytes, or of a volume's values, affine and quantity."""
+    if content == "copy":
         try:
             return hashlib.sha256(path.read_bytes()).hexdigest()
         except OSError as error:
             raise InputError(f"{path}: {error.strerror or error}") from None
-    volume = read_volume(path) if is_copy else _volume(path, what)
-    found = hashlib.sha256(f"{volume.quantity} {volume.grid.shape}".encode())
-    found.update(np.ascontiguousarray(volume.grid.affine, "<f8").tobytes())
-    found.update(np.ascontiguousarray(volume.array, "<f4").tobytes())
-    return found.hexdigest()
+    volume = read_volume(path) if is_copy else _read_original(path, content)
+    digest = hashlib.sha256(f"{volume.quantity} {volume.grid.shape}".encode())
+    digest.update(np.ascontiguousarray(volume.grid.affine, "<f8").tobytes())
+    digest.update(np.ascontiguousarray(volume.array, "<f4").tobytes())
+    return digest.hexdigest()
 
 
-def _volume(path: Path, what: str) -> Volume:
-    """The volume in a user's file."""
-    quantity, _, energy = what.partition(" at ")
+def _read_original(path: Path, content: str) -> Volume:
+    """Read the volume in a user's file as the quantity that `content` names."""
+    quantity, _, energy = content.partition(" at ")
     return read_mu(path, energy or None) if quantity == "mu" else read_volume_of(path, quantity)
 
 
 def _stem(path: Path) -> str:
+    """Return the file name of a volume without its ending, .nii.gz included."""
     name = path.name
     return name[: -len(".nii.gz")] if name.lower().endswith(".nii.gz") else path.stem

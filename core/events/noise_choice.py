@@ -1,4 +1,4 @@
-"""Which noise the images of an event are read with."""
+"""Choice of the noise with which the images of an event are read."""
 
 from collections.abc import Collection
 from typing import Literal
@@ -11,36 +11,39 @@ from ..validation import seed_number
 from .event_set import COUNTED, Event, EventSet
 
 NoiseChoice = int | Literal["own"] | None
-"""None: none, the mean images. "own": the noise that the set gives each event. A number: noise of another seed."""
+"""Noise of the images: None for expected means, "own" for the seed stored in each event, or another seed."""
 
 
 def checked_noise(noise: object) -> NoiseChoice:
-    """`noise` where it is one of a `NoiseChoice`, or `InputError`."""
+    """Return `noise` if it is a valid `NoiseChoice`, or raise `InputError`."""
     if noise is None or noise == "own":
         return noise  # type: ignore[return-value]
     return seed_number(noise, f"noise {noise!r:.40}", "own, or a seed: ")
 
 
-def chosen_seed(own: int, noise: NoiseChoice) -> int | None:
-    """The seed of the noise of an event whose `own` seed is that; None: no noise."""
+def chosen_seed(event_seed: int, noise: NoiseChoice) -> int | None:
+    """Return the noise seed of an event whose stored seed is `event_seed`; None for no noise."""
     if noise is None or noise == "own":
-        return own if noise == "own" else None
-    return mixed_seed(own, noise)
+        return event_seed if noise == "own" else None
+    return mixed_seed(event_seed, noise)
 
 
-def mixed_seed(own: int, *others: int) -> int:
-    """A seed made of an event's own and others, such as an epoch: events of one seed still have noise each of its own."""
-    return int(np.random.SeedSequence((own, *others)).generate_state(1, np.uint64)[0])
+def mixed_seed(event_seed: int, *numbers: int) -> int:
+    """Return a seed mixed from an event's stored seed and other numbers, such as a seed and an epoch.
+
+    Events therefore have independent noise although the other numbers are the same for all.
+    """
+    return int(np.random.SeedSequence((event_seed, *numbers)).generate_state(1, np.uint64)[0])
 
 
 def noisy_images(event: Event, model: str, seed: int | None, level: float, out: Floats32 | None = None) -> Floats32:
-    """A model's images (M, n_v, n_u): of counts and photons with noise of a seed and a level, others as they are."""
+    """Return a model's images (M, n_v, n_u): counts and photons at a level, with noise of a seed; others as stored."""
     if event.unit(model) not in COUNTED:
         return event.images(model, out=out)
     return event.images(model, noise_seed=seed, level=level, out=out)
 
 
 def require_counted(events: EventSet, models: Collection[str]) -> None:
-    """Raise `InputError` unless noise changes the images of at least one of these models."""
+    """Raise `InputError` unless at least one of these models has images of counts or photons, which have noise."""
     if not any(events[0].unit(model) in COUNTED for model in models):
         raise InputError(f"noise: only counts and photons have it, and {', '.join(models) or 'no model'} gives none")

@@ -1,4 +1,4 @@
-"""The programs that event sets are exported for, one line each; what writes for them is imported when it is wanted."""
+"""Table of the programs for which event sets are exported; the class that writes for one is imported on first use."""
 
 from __future__ import annotations
 
@@ -8,25 +8,28 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from .exports.layout import Layout
+    from .exports.layout import ExportLayout
 
 
 @dataclass(frozen=True)
 class Program:
-    """A program, or a layout, that sets are exported for."""
+    """A program, or a layout of files, for which event sets are exported."""
 
-    name: str  # on the command line
-    title: str  # what is written, in one line
-    of: str  # its layout's class, in the module of `exports` that is called alike
+    name: str
+    """Name on the command line."""
+    title: str
+    """Description of the written files, in one line."""
+    class_name: str
+    """Name of the `ExportLayout` class, whose module in `exports` has the same name in lower case."""
 
     @property
-    def layout(self) -> type[Layout]:
-        """Made of what is chosen, with the program's options as keyword-only parameters."""
-        return getattr(import_module(f".exports.{self.of.lower()}", __package__), self.of)
+    def layout(self) -> type[ExportLayout]:
+        """The class that writes the files: called with an `ExportSelection` and the program's options as keywords."""
+        return getattr(import_module(f".exports.{self.class_name.lower()}", __package__), self.class_name)
 
     @property
     def options(self) -> tuple[str, ...]:
-        """Names of its options."""
+        """The names of the program's options."""
         parameters = inspect.signature(self.layout).parameters.values()
         return tuple(p.name for p in parameters if p.kind is p.KEYWORD_ONLY)
 
@@ -35,8 +38,8 @@ _PROGRAMS = (
     Program(
         "legacy", "truth_i.pt, Projections_i.pt by slots, ProjRadonN_i.pt, RunTranslate.npy, RunRotate.npy", "Legacy"
     ),
-    Program("3dunet", "pytorch-3dunet: an HDF5 file an event with raw and label, in a folder for each split", "Unet3d"),
+    Program("3dunet", "pytorch-3dunet: an HDF5 file per event with raw and label, in a folder per split", "Unet3d"),
     Program("webdataset", "tar archives for WebDataset, of one split each", "WebDataset"),
-    Program("npz", "an archive of numpy an event, with all that is known of it", "Npz"),
+    Program("npz", "one NumPy archive per event, with all its arrays, settings and poses", "Npz"),
 )
 PROGRAMS: dict[str, Program] = {program.name: program for program in _PROGRAMS}

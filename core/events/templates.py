@@ -1,4 +1,4 @@
-"""Recipes to begin with: commented files that users copy and change."""
+"""Recipe templates: commented recipes that users copy and change."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -17,11 +17,13 @@ TEMPLATES: Mapping[str, str] = MappingProxyType({
     "mixed": "phantoms of several kinds in any position, one for the test alone; small images",
     "files": "your own volumes, each placed and turned a little differently, with their attenuation",
 })  # fmt: skip
-"""What each template is, by name."""
+"""Descriptions of the templates, by name."""
 
 
 def template_text(name: str, workbook: AnyPath = EXAMPLE) -> str:
-    """The text of a template (TOML), with a workbook's path as the recipe's folder sees it; `InputError` for another name.
+    """Return the text of a template (TOML) with the path of a workbook, relative to the recipe's folder or absolute.
+
+    `InputError` where there is no template of this name.
 
     >>> Path("derenzo.toml").write_text(template_text("derenzo", "scanner.xlsx"))
     """
@@ -30,6 +32,6 @@ def template_text(name: str, workbook: AnyPath = EXAMPLE) -> str:
 
 
 def with_workbook(text: str, workbook: AnyPath) -> str:
-    """A recipe's text with a workbook's path in place of the example's."""
+    """Return a recipe's text with the path of a workbook in place of the example's."""
     path = str(workbook) if isinstance(workbook, str) else Path(workbook).as_posix()
     return text.replace(toml_value(EXAMPLE.name), toml_value(path), 1)

@@ -1,4 +1,4 @@
-"""Event sets for training with torch."""
+"""Training with torch: event sets as a torch `Dataset`."""
 
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Literal
@@ -14,8 +14,8 @@ from .noise_choice import require_counted
 if TYPE_CHECKING:
     from torch.utils.data import Dataset
 
-_PLACES: Shapes = {"affine": (4, 4), "pose": (4, 4), "position": (3,), "euler_degrees": (3,)}
-"""Fields besides those of `field_shapes`."""
+_PLACEMENT_SHAPES: Shapes = {"affine": (4, 4), "pose": (4, 4), "position": (3,), "euler_degrees": (3,)}
+"""Shapes of the fields of an event besides its arrays (`field_shapes`)."""
 _SLOTS = "/slots"
 
 Size = int | Sequence[int | None]
@@ -34,7 +34,7 @@ def torch_dataset(
     slots: AnyPath | None = None,
     skip_damaged: bool = False,
 ) -> "Dataset[dict[str, Any]]":
-    """The events as a torch `Dataset` of dicts of float32 tensors, for a `DataLoader` with any number of workers.
+    """Return the events as a torch `Dataset` of dicts of float32 tensors, for a `DataLoader` with any number of workers.
 
     An item depends on the set, the event, the epoch and `seed` alone, not on workers or order. No file stays open, so
     workers may fork or spawn.
@@ -44,41 +44,41 @@ def torch_dataset(
     events : EventSet
         For instance ``set.split("train")``.
     fields
-        Which tensors an item has: "truth" (n_x, n_y, n_z), "affine" (4, 4) of its voxels, "pose" (4, 4), "position" (3,),
-        mm, "euler_degrees" (3,), "radon96" (96, n_v, n_u), the name of a model for its images (M, n_v, n_u), and
-        "NAME/slots" for these in the order of the users' layout (S, n_v, n_u). Besides, each item has its event's "number"
-        and, with noise, its "level".
+        Tensors of an item: "truth" (n_x, n_y, n_z), "affine" (4, 4) of its voxels, "pose" (4, 4), "position" (3,), mm,
+        "euler_degrees" (3,), "radon96" (96, n_v, n_u), the name of a model for its images (M, n_v, n_u), and "NAME/slots"
+        for these images in the order of the users' layout (S, n_v, n_u). Each item also has its event's "number" and, with
+        noise, its "level".
     crop
-        Size of a part of the truth, voxels: one number or three; or by fields, such as
-        ``{"truth": 64, ("counts/slots", "radon96"): (None, 128, 128)}``. Fields that are named together are cut at the same
-        place; along an axis of None nothing is cut. Where a part begins is in the item, as "truth_start"; "affine" is that
-        of the part.
+        Size of the part of the truth to read, voxels: one number or three; or sizes by field, such as
+        ``{"truth": 64, ("counts/slots", "radon96"): (None, 128, 128)}``. Fields named together are cropped at the same
+        position; an axis of None is not cropped. The item holds the first index of a part, as "truth_start", and "affine"
+        is that of the part.
     crop_at
-        "random": in each epoch elsewhere. "center": in the middle.
+        "random": at another position in each epoch. "center": at the centre.
     noise
-        None: mean images. "own": the noise of each event's own seed. "epoch": another noise in each epoch
+        None: mean images. "own": noise of each event's own seed. "epoch": new noise in each epoch
         (``dataset.set_epoch(epoch)``).
     levels
-        With noise, shares of the acquisition time, one or several; default: those of the recipe. One is drawn for each
-        event, with the noise of "epoch" for each epoch anew.
+        With noise, one or several fractions of the acquisition time; default: those of the recipe. One is drawn for each
+        event, and with the noise "epoch" in each epoch again.
     seed
-        Of random crops, levels and the noise of "epoch": a whole number of at least 0.
+        Seed of random crops, levels and the noise "epoch": a whole number of at least 0.
     slots
-        A table of them (`read_slots`), for "NAME/slots", instead of a row of images and its mirrored ones.
+        Table of slots (`read_slots`) for "NAME/slots"; default: a ring of images in a row, followed by mirrored ones.
     skip_damaged
-        Instead of an event whose file is damaged or missing the next one is read, with an `InputWarning`; otherwise that is
-        an `InputError`, also in a loader's workers.
+        Whether to replace an event whose file is damaged or missing by the next one, with an `InputWarning`. Otherwise
+        `InputError` is raised, also in a loader's workers.
 
     Returns
     -------
     Dataset
-        Of torch, with ``set_epoch(epoch)``, which also reaches workers that a loader keeps (``persistent_workers=True``):
-        call it before each epoch.
+        Dataset of torch with a method ``set_epoch(epoch)``, to be called before each epoch. It also reaches the workers
+        that a loader keeps (``persistent_workers=True``).
 
     Raises
     ------
     InputError
-        A field that the set does not have, a part larger than the field, or torch is missing.
+        The set does not have a field, a crop is larger than its field, or torch is missing.
 
     Examples
     --------
@@ -93,42 +93,42 @@ def torch_dataset(
         from .torch_events import TorchEvents
 
     instance(events, EventSet, "torch_dataset")
-    arrays = field_shapes(events)
+    array_shapes = field_shapes(events)
     one_of(crop_at, ("random", "center"), "crop_at")
     one_of(noise, (None, "own", "epoch"), "noise")
     seed_number(seed)
     if levels is None:
         levels = (1.0,) if noise is None else events.recipe.levels
     elif noise is None:
-        raise InputError("levels: they are of the noise; choose noise as well, or leave them out")
+        raise InputError("levels: need noise; choose noise as well, or leave them out")
     chosen_levels = [positive(level, "levels") for level in (levels if isinstance(levels, Sequence) else (levels,))]
     if not chosen_levels:
         raise InputError("levels: expected one or more, got none")
-    known, chosen_slots = arrays | _PLACES, None
+    known_shapes, chosen_slots = array_shapes | _PLACEMENT_SHAPES, None
     models = tuple(events.recipe.models)
     names = (fields,) if isinstance(fields, str) else tuple(dict.fromkeys(fields))
     if any(name.endswith(_SLOTS) for name in names):
         chosen_slots = row_slots(events.system) if slots is None else read_slots(slots, events.system)
-        known |= {f"{model}{_SLOTS}": (len(chosen_slots), *known[model][1:]) for model in models}
+        known_shapes |= {f"{model}{_SLOTS}": (len(chosen_slots), *known_shapes[model][1:]) for model in models}
+    possible = dict.fromkeys([*known_shapes, *(f"{model}{_SLOTS}" for model in models)])
     for name in names:
-        one_of(name, known if chosen_slots else [*known, *(f"{model}{_SLOTS}" for model in models)], "field")
+        one_of(name, possible, "field")
     if noise is not None:
         require_counted(events, [name for name in models if name in names or f"{name}{_SLOTS}" in names])
-    shapes = {name: known[name] for name in names}
-    crops = _crops(crop, shapes)
-    at_random = crop_at == "random"
-    return TorchEvents(events, shapes, crops, at_random, noise, chosen_levels, seed, chosen_slots, skip_damaged)
+    shapes = {name: known_shapes[name] for name in names}
+    crops, is_random = _checked_crops(crop, shapes), crop_at == "random"
+    return TorchEvents(events, shapes, crops, is_random, noise, chosen_levels, seed, chosen_slots, skip_damaged)
 
 
-def _crops(crop: Crop, shapes: Mapping[str, tuple[int, ...]]) -> dict[tuple[str, ...], tuple[int | None, ...]]:
-    """The sizes of parts by the fields that they are cut from together."""
+def _checked_crops(crop: Crop, shapes: Mapping[str, tuple[int, ...]]) -> dict[tuple[str, ...], tuple[int | None, ...]]:
+    """Return the sizes of crops by the fields that are cropped together; `InputError` where a crop is impossible."""
     if crop is None:
         return {}
-    found: dict[tuple[str, ...], tuple[int | None, ...]] = {}
+    crops: dict[tuple[str, ...], tuple[int | None, ...]] = {}
     for key, size in (crop if isinstance(crop, Mapping) else {"truth": crop}).items():
         names = (key,) if isinstance(key, str) else tuple(key)
         for name in names:
-            if name not in shapes or len(shapes[name]) != 3 or any(name in others for others in found):
+            if name not in shapes or len(shapes[name]) != 3 or any(name in fields for fields in crops):
                 raise InputError(f"crop: {name!r}: expected one of the fields of three axes that are read, each once")
             if shapes[name] != shapes[names[0]]:
                 raise InputError(f"crop: {', '.join(names)}: expected fields of one shape")
@@ -138,5 +138,5 @@ def _crops(crop: Crop, shapes: Mapping[str, tuple[int, ...]]) -> dict[tuple[str,
         for n, length in zip(sizes, shapes[names[0]], strict=True):
             if n is not None and strict_whole(n, "crop", "whole numbers of at least 1, or None") > length:
                 raise InputError(f"crop: {', '.join(names)}: a part of {n} along an axis of {length}")
-        found[names] = sizes
-    return found
+        crops[names] = sizes
+    return crops

@@ -1,4 +1,4 @@
-"""Making the events of a set: which are missing, one after the other, each written whole."""
+"""Making of an event set: the missing events, one after the other or in parallel, each file written whole."""
 
 import re
 import time
@@ -12,36 +12,42 @@ from ..files import AnyPath, Locked, ensure_folder, remove_leftovers
 from ..memory import readable_size
 from ..progress import Progress, tell
 from ..validation import seed_number, whole_number
-from .dask_work import in_cluster
+from .dask_work import make_in_cluster
 from .event_maker import EventMaker
 from .event_set import EventSet
 from .folders import SetFolder
 from .planning import plan
-from .pool import in_processes
+from .pool import make_in_processes
 from .recipe import EventRecipe
 from .store import SHARD_BYTES, Store
 from .writing import EventWriter, Written
 
-_MOST = 10**7
-"""Events in a set."""
-_CHECKED, _CHECK_SECONDS = 1000, 1.0
-"""The settings of so many events are checked before the work begins, for so many seconds at most."""
+_MAX_EVENTS = 10**7
+"""Largest number of events in a set."""
+_MAX_CHECKED, _CHECK_SECONDS = 1000, 1.0
+"""Number of events whose settings are checked before the work begins, and the time, s, after which this stops."""
 
 
 @dataclass(frozen=True)
 class Made:
-    """An event that is in the set now."""
+    """Report on an event that was made and is in the set now."""
 
     number: int
+    """Number of the event."""
     path: Path
-    size: int  # bytes
-    seconds: float  # that it took
-    done: int  # events made by this work so far
-    total: int  # that it makes in all
+    """Path of its file."""
+    size: int
+    """Bytes of its file."""
+    seconds: float
+    """Time that the event took, s."""
+    done: int
+    """Number of events made so far by this call."""
+    total: int
+    """Number of events that this call makes in all."""
 
 
 class Making(Iterator[Made]):
-    """Work on a set: makes the events `missing` in `folder`, and gives each once it is made; the rest as in `making`."""
+    """Iterator that makes the events `missing` in `folder` and reports each; other arguments are as in `making`."""
 
     def __init__(
         self,
@@ -55,44 +61,44 @@ class Making(Iterator[Made]):
         if (workers := whole_number(workers, "workers")) > 1:
             workers = min(workers, max(1, len(missing)))
         if dask is not None and missing:
-            written = in_cluster(folder, missing, dask, workers)
+            written = make_in_cluster(folder, missing, dask, workers)
         elif workers > 1:
-            written = in_processes(folder, missing, workers)
+            written = make_in_processes(folder, missing, workers)
         else:
-            written = _in_turn(folder, missing, progress)
-        self._made = self._follow(written)
+            written = _make_in_turn(folder, missing, progress)
+        self._made = self._report(written)
 
     def __next__(self) -> Made:
         return next(self._made)
 
-    def _follow(self, written: Iterator[Written]) -> Iterator[Made]:
-        """The events as they are written; each warning is given once, for the first event that it is about."""
-        given: set[str] = set()
-        store, unpacked = self.folder.store, 0
+    def _report(self, written: Iterator[Written]) -> Iterator[Made]:
+        """Yield a report on each event that was written; show each warning once, for the first event that gave it."""
+        patterns: set[str] = set()
+        store, unpacked_bytes = self.folder.store, 0
         try:
-            for done, event in enumerate(written, 1):
+            for n_made, event in enumerate(written, 1):
                 for text in event.warnings:
-                    words = re.sub(r"[\d.]+", "", text)  # the same with other numbers says nothing new
-                    if words not in given:
-                        given.add(words)
+                    pattern = re.sub(r"[\d.]+", "", text)  # warnings that differ in numbers alone are shown once
+                    if pattern not in patterns:
+                        patterns.add(pattern)
                         warn(f"event {event.number}: {text}", 3)
                 path = store.event_path(event.number)
-                yield Made(event.number, path, event.size, event.seconds, done, len(self.missing))
-                unpacked += event.size
-                if unpacked >= SHARD_BYTES:
-                    _pack(store)
-                    unpacked = 0
+                yield Made(event.number, path, event.size, event.seconds, n_made, len(self.missing))
+                unpacked_bytes += event.size
+                if unpacked_bytes >= SHARD_BYTES:
+                    _pack_if_sharded(store)
+                    unpacked_bytes = 0
         except BaseException:
-            with suppress(Exception):  # of the same full disk, or since Python ends
+            with suppress(Exception):  # it may fail for the same reason, such as a full disk
                 self.folder.complete_index()
             raise
         self.folder.complete_index()
-        remove_leftovers(store.events)  # of workers that died
-        _pack(store)
+        remove_leftovers(store.events)  # files that workers were writing when they died
+        _pack_if_sharded(store)
 
 
-def _pack(store: Store) -> None:
-    """Put what was made into shards where the set has some, unless another work is doing it."""
+def _pack_if_sharded(store: Store) -> None:
+    """Move single events into shards where the set has shards, unless another process is doing so."""
     if store.shards.is_dir():
         with suppress(Locked):
             store.pack()
@@ -109,26 +115,26 @@ def making(
     dask: str | None = None,
     pack: bool = False,
 ) -> Making:
-    """Make the events of a set that are missing, one by one, as `make` does.
+    """Return an iterator that makes the missing events of a set, as `make` does, and reports each.
 
     Parameters
     ----------
     recipe, folder, count, first, workers
-        The same as in `make`. Without a count: the events that were asked for before.
+        The arguments of `make`. Without a count, the events requested by earlier calls are made.
     shard
-        ``(i, n)``: only part i, from 1, of n equal ones; several machines may work on one folder so.
+        ``(i, n)``: make only part i, from 1, of n equal parts, so that several machines can work on one folder.
     progress
         Called as ``progress(steps done, steps)`` within an event, with one worker; may raise `Cancelled`.
     dask
-        Address of a Dask scheduler, whose workers make the events and see `folder` under the same path; ``"local"``: as many
-        workers as `workers` on this machine.
+        Address of a Dask scheduler, whose workers make the events and see `folder` under the same path; ``"local"`` for
+        `workers` processes of this machine.
     pack
-        Whether events go into shards; a set that has some goes on so.
+        Whether events go into shards; a set that has shards continues to use them.
 
     Returns
     -------
     Making
-        Iterates over `Made`: each event, once it is in the set. Nothing is computed before its first.
+        Iterator over `Made`, a report on each event once it is in the set. Computing begins with the first iteration.
 
     Raises
     ------
@@ -137,34 +143,35 @@ def making(
     """
     seed_number(first, "first")
     target = SetFolder(folder)
-    asked = target.asked if count is None else [range(first, first + whole_number(count, "count"))]
-    if not asked:
-        raise InputError(f"{target.path}: it holds no events: say how many to make (-n)")
-    maker, most = EventMaker(recipe), asked[-1].stop
-    if most > _MOST:
-        size = readable_size(maker.raw_bytes * most)
-        raise InputError(f"count: at most {_MOST:,} events in a set, got {most:,}, of up to {size} uncompressed")
+    requested = target.requested if count is None else [range(first, first + whole_number(count, "count"))]
+    if not requested:
+        raise InputError(f"{target.path}: holds no events: give the number of events to make (-n)")
+    maker, stop = EventMaker(recipe), requested[-1].stop
+    if stop > _MAX_EVENTS:
+        size = readable_size(maker.raw_bytes * stop)
+        raise InputError(f"count: at most {_MAX_EVENTS:,} events in a set, got {stop:,}, of up to {size} uncompressed")
     maker.require_memory()
-    mine = _part(asked, *shard)
+    numbers = _shard_numbers(requested, *shard)
     end = time.monotonic() + _CHECK_SECONDS
-    # What does not fit together shows before anything is computed.
-    for number in mine[:: max(1, len(mine) // _CHECKED)]:
+    # Settings that contradict each other are refused before anything is computed.
+    for number in numbers[:: max(1, len(numbers) // _MAX_CHECKED)]:
         if time.monotonic() < end and not target.store.event_path(number).exists():
             _ = plan(recipe, number).phantom
-    missing = target.prepare(recipe, asked, mine)
+    missing = target.prepare(recipe, requested, numbers)
     if pack:
         ensure_folder(target.store.shards)
     return Making(target, missing, workers, progress, dask)
 
 
-def _part(asked: Sequence[range], place: int, parts: int) -> list[int]:
-    """The events of a shard: those whose numbers leave the same rest."""
-    if not (isinstance(place, int) and isinstance(parts, int) and 1 <= place <= parts):
-        raise InputError(f"shard: expected i/n with i from 1 to n, got {place}/{parts}")
-    return [n for part in asked for n in range(part.start + (place - 1 - part.start) % parts, part.stop, parts)]
+def _shard_numbers(requested: Sequence[range], i: int, n: int) -> list[int]:
+    """Return the numbers of part i of n, from 1, of the requested events: every number that is i - 1 modulo n."""
+    if not (isinstance(i, int) and isinstance(n, int) and 1 <= i <= n):
+        raise InputError(f"shard: expected i/n with i from 1 to n, got {i}/{n}")
+    return [number for span in requested for number in range(span.start + (i - 1 - span.start) % n, span.stop, n)]
 
 
-def _in_turn(target: SetFolder, missing: Sequence[int], progress: Progress | None) -> Iterator[Written]:
+def _make_in_turn(target: SetFolder, missing: Sequence[int], progress: Progress | None) -> Iterator[Written]:
+    """Make events in this process, one after the other, and yield each."""
     writer = EventWriter(target.path)
     for number in missing:
         yield writer.write(number, progress)
@@ -178,21 +185,21 @@ def make(
     workers: int = 1,
     progress: Progress | None = None,
 ) -> EventSet:
-    """Make events `first` to ``first + count - 1`` of a recipe; those that the folder holds already are kept.
+    """Make events `first` to ``first + count - 1`` of a recipe; events that the folder holds already are not made again.
 
     Event i depends on the recipe, its seed and i alone: a set may be made in parts, by any number of workers, on several
-    machines. Each file is written whole or not at all, so work that is stopped, in whatever way, goes on where it was.
+    machines. Each file is written whole or not at all, so work that is stopped or killed continues at the next call.
 
     Parameters
     ----------
     recipe : EventRecipe
         From `read_recipe`. The folder keeps its text and copies of the files that it names.
     folder
-        New, or that of an event set of the same recipe.
+        A new folder, or that of an event set of the same recipe.
     count, first
-        How many events, from which number.
+        Number of events, and number of the first.
     workers
-        Processes; they share the processor's cores. With more than one, a script calls this under
+        Number of processes, which share the processor's cores. With more than one, a script must call this under
         ``if __name__ == "__main__":``, as always with Python's processes.
     progress
         Called as ``progress(events done, events)``; may raise `Cancelled`.
@@ -205,8 +212,8 @@ def make(
     Raises
     ------
     InputError
-        Another recipe in the folder, settings that do not go together (before anything is made), or a file that cannot be
-        written.
+        The folder holds another recipe, settings contradict each other (found before anything is made), or a file cannot
+        be written.
 
     Examples
     --------
@@ -215,6 +222,6 @@ def make(
     (80, 256, 256)
     """
     count = whole_number(count, "count")
-    for made in making(recipe, folder, count, first, workers):
-        tell(progress, made.done, made.total)
+    for event in making(recipe, folder, count, first, workers):
+        tell(progress, event.done, event.total)
     return EventSet(folder)

@@ -1,4 +1,4 @@
-"""What a worker does: make an event of a set and write its file."""
+"""Task of a worker process: to make an event of a set and write its file."""
 
 import os
 import time
@@ -7,24 +7,24 @@ from typing import Any, NamedTuple
 from ..files import AnyPath, write_bytes
 from ..progress import Progress
 from ..recording import recorded_warnings
-from .event_files import Place, packed
+from .event_files import FileLocation, pack
 from .event_maker import EventMaker
 from .folders import SetFolder
 
 
 class Written(NamedTuple):
-    """An event's file, as a worker wrote it."""
+    """Report of a worker on an event whose file it has written."""
 
-    number: int
-    size: int  # bytes
-    seconds: float
-    warnings: tuple[str, ...]
+    number: int  # number of the event
+    size: int  # bytes of the file
+    seconds: float  # time that the event took
+    warnings: tuple[str, ...]  # warnings that the event gave
 
 
 class EventWriter:
-    """Makes events of a set that is prepared and writes their files: what a worker does.
+    """Writer of a set's events, in a folder that `SetFolder.prepare` has prepared.
 
-    `threads` is how many an event takes, by default one per core.
+    `threads` is the number of threads that make an event, by default one per core.
     """
 
     def __init__(self, folder: AnyPath, threads: int | None = None) -> None:
@@ -33,20 +33,20 @@ class EventWriter:
         self._indexed = set(self.folder.index.read())
 
     def write(self, number: int, progress: Progress | None = None) -> Written:
-        """Make an event and write its file, unless another work has; `progress` as in `EventMaker.make`."""
+        """Make an event and write its file and row, unless another process has; `progress` is as in `EventMaker.make`."""
         started, folder = time.monotonic(), self.folder
-        place, warnings, size = Place(str(folder.store.event_path(number))), list[str](), 0
-        if not folder.is_made(number, place):
-            with recorded_warnings() as given:
+        location, warnings, size = FileLocation(str(folder.store.event_path(number))), list[str](), 0
+        if not folder.is_made(number, location):
+            with recorded_warnings() as other_warnings:
                 event = self.maker.make(number, progress)
-            data = packed(event, folder.recipe, self._geometry(), self.maker.threads)
-            write_bytes(place.path, data)
-            warnings, size = [*event.warnings, *given], len(data)
+            data = pack(event, folder.recipe, self._geometry_arrays(), self.maker.threads)
+            write_bytes(location.path, data)
+            warnings, size = [*event.warnings, *other_warnings], len(data)
         if number not in self._indexed:
             folder.index.add(number)
-        return Written(number, size or os.stat(place.path).st_size, time.monotonic() - started, tuple(warnings))
+        return Written(number, size or os.stat(location.path).st_size, time.monotonic() - started, tuple(warnings))
 
-    def _geometry(self) -> dict[str, Any]:
-        maker = self.maker
-        matrices = maker.views.projection_matrices()
-        return {"projection_matrix": (matrices, "pixel"), "number": (maker.system.numbers, "1")}
+    def _geometry_arrays(self) -> dict[str, Any]:
+        """Return the projection matrices (M, 3, 4) and the modules' numbers (M,), with units, for an event's file."""
+        matrices, numbers = self.maker.views.projection_matrices(), self.maker.system.numbers
+        return {"projection_matrix": (matrices, "pixel"), "number": (numbers, "1")}

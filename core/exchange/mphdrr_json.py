@@ -1,4 +1,4 @@
-"""mphDRR's own JSON file of a geometry. It holds every digit and can be read back."""
+"""Format of mphDRR: a JSON file of a geometry that holds every digit and can be read back."""
 
 import json
 from pathlib import Path
@@ -23,14 +23,15 @@ _CONVENTIONS = {
     "projection_matrix": "3 x 4, homogeneous world point to (column, row, 1) times depth; 0 is the centre of pixel 0",
 }
 _FILE_NAMES = {"centers": "pinhole_center"}
-"""Attribute of a scanner -> its name in the file, where that is another."""
-_VIEW = {"source": "sources", "detector_center": "detector_centers", "u_step": "u_steps", "v_step": "v_steps"}
+"""Names in the file of attributes of a scanner that are called otherwise there."""
+_VIEW_FIELDS = {"source": "sources", "detector_center": "detector_centers", "u_step": "u_steps", "v_step": "v_steps"}
 
 
 def _write(system: Scanner, views: Views, temporary: Path) -> None:
+    """Write the modules' values and frames, and the views, into the file `temporary`."""
     modules = {"number": system.numbers, "frame": system.frames()}
     modules |= {_FILE_NAMES.get(name, name): values for name, values in system.filled().items()}
-    images = {name: getattr(views, field) for name, field in _VIEW.items()}
+    images = {name: getattr(views, field) for name, field in _VIEW_FIELDS.items()}
     images["projection_matrix"] = views.projection_matrices()
     document = {
         "kind": _KIND,
@@ -46,7 +47,10 @@ def _write(system: Scanner, views: Views, temporary: Path) -> None:
 
 
 def read_geometry(path: AnyPath) -> tuple[Scanner, Views]:
-    """Read what `write_geometry` wrote in the format ``"mphdrr"``, bit for bit; `InputError` for any other file."""
+    """Read scanner and views, bit for bit, from a file that `write_geometry` wrote in the format ``"mphdrr"``.
+
+    `InputError` for any other file.
+    """
     content = read_bytes(path)
     try:
         document = json.loads(content)
@@ -56,13 +60,13 @@ def read_geometry(path: AnyPath) -> tuple[Scanner, Views]:
             raise InputError(f"version {document.get('version')!r}; this mphDRR reads {_VERSION}")
         modules = document["modules"]
         kind = scanner_kind(document.get("scanner", PinholeSystem.kind))
-        given: dict[str, Any] = {"numbers": [one["number"] for one in modules]}
+        arguments: dict[str, Any] = {"numbers": [entry["number"] for entry in modules]}
         for field, (column, *_) in kind.columns.fields.items():
             name = _FILE_NAMES.get(field, field)
-            if not column.has_constant_blank or any(name in one for one in modules):
-                given[field] = [one[name] for one in modules]
-        views: Any = {field: [one[name] for one in document["views"]] for name, field in _VIEW.items()}
-        return kind.of(given), Views(**views, shape=(document["rows"], document["columns"]))
+            if not column.has_constant_blank or any(name in entry for entry in modules):
+                arguments[field] = [entry[name] for entry in modules]
+        views: Any = {field: [entry[name] for entry in document["views"]] for name, field in _VIEW_FIELDS.items()}
+        return kind.of(arguments), Views(**views, shape=(document["rows"], document["columns"]))
     except InputError as error:
         reason = str(error)
     except (ValueError, RecursionError) as error:

@@ -1,7 +1,7 @@
-"""The modules as solids: STL, 3MF and GLB of collimators, with their aperture plates, and of crystals.
+"""Formats of solids: STL, 3MF and GLB of collimators, with their aperture plates, and of crystals.
 
-Every part is a closed surface of its own in world mm: origin at the isocentre, +z along the patient. 3MF and GLB name and
-colour the parts ("Module 07 collimator"). STL can do neither, so there is also a folder with one file for each part.
+Every part is a separate closed surface in world mm: origin at the isocentre, +z along the patient. 3MF and GLB hold the
+parts' names ("Module 07 collimator") and colours. STL has neither, so there is also a format with one file for each part.
 """
 
 import io
@@ -21,12 +21,12 @@ from ..validation import one_of
 from ..version import VERSION
 from .format import Format
 
-_KINDS = {"collimators": ("collimator",), "crystals": ("crystal",), "all": tuple(LOOKS)}
+_PART_KINDS = {"collimators": ("collimator",), "crystals": ("crystal",), "all": tuple(LOOKS)}
 _Save = Callable[[Path, list[ModulePart]], None]
 
 
 def _solid_format(name: str, title: str, suffixes: tuple[str, ...], save: _Save) -> Format:
-    """A format of the chosen parts, written by `save`."""
+    """Return the format of the parts that its options choose, which `save` writes."""
 
     def write(
         system: Scanner,
@@ -39,14 +39,16 @@ def _solid_format(name: str, title: str, suffixes: tuple[str, ...], save: _Save)
         opening_degrees: float = 90.0,
         edge_at: EdgePlace = "middle",
     ) -> None:
-        one_of(part, _KINDS, "part")
+        """Write the parts of the system's modules; the keyword-only arguments are the options of the format."""
+        one_of(part, _PART_KINDS, "part")
         construction = Construction(plate_thickness, wall_thickness, angle_from_degrees(opening_degrees), edge_at)
-        save(temporary, [p for p in system.parts(construction) if p.kind in _KINDS[part]])
+        save(temporary, [p for p in system.parts(construction) if p.kind in _PART_KINDS[part]])
 
     return Format(name, title, suffixes, write)
 
 
 def _save_stl(temporary: Path, parts: list[ModulePart]) -> None:
+    """Write all parts into one binary STL file."""
     import trimesh
 
     meshes = [trimesh.Trimesh(p.vertices, p.triangles, process=False) for p in parts]
@@ -54,6 +56,7 @@ def _save_stl(temporary: Path, parts: list[ModulePart]) -> None:
 
 
 def _save_stl_parts(temporary: Path, parts: list[ModulePart]) -> None:
+    """Write a folder with a binary STL file for each part."""
     for p in parts:
         _save_stl(temporary / f"{p.name}.stl", [p])
 
@@ -72,9 +75,9 @@ _RELATIONSHIPS = """<?xml version="1.0" encoding="UTF-8"?>
 
 
 def _save_3mf(temporary: Path, parts: list[ModulePart]) -> None:
-    """3MF (Core Specification 1.2) in millimetres, a named object for each part."""
+    """Write 3MF (Core Specification 1.2) in millimetres, with a named object for each part."""
     bases, looks = [], {kind: look for kind, look in LOOKS.items() if any(p.kind == kind for p in parts)}
-    for kind, look in looks.items():  # whose colours are linear, while 3MF's are sRGB
+    for kind, look in looks.items():  # colours of `LOOKS` are linear, those of 3MF sRGB
         shares = (1.055 * x ** (1 / 2.4) - 0.055 if x > 0.0031308 else 12.92 * x for x in look.color[:3])
         color = "".join(f"{round(255 * share):02X}" for share in shares)
         bases.append(f'<base name="{kind}" displaycolor="#{color}"/>')
@@ -101,10 +104,10 @@ def _save_3mf(temporary: Path, parts: list[ModulePart]) -> None:
 
 
 def _save_glb(temporary: Path, parts: list[ModulePart]) -> None:
-    """Binary glTF 2.0, a named mesh for each part.
+    """Write binary glTF 2.0, with a named mesh for each part.
 
-    The meshes are in world mm. glTF's unit is the metre and its +y points up, so they hang on one node that scales by 0.001
-    and turns +z to +y: programs that read glTF show the scanner in its true size.
+    The meshes are in world mm. glTF's unit is the metre and its +y points up, so all meshes are children of one node that
+    scales by 0.001 and turns +z to +y: programs that read glTF show the scanner in its true size.
     """
     import trimesh
     from trimesh.visual import TextureVisuals

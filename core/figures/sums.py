@@ -29,7 +29,7 @@ def orthogonal_sum(volume: Volume, axis: int) -> tuple[Floats32, Floats]:
     ends = np.empty((2, n_pixels[right], n_pixels[up], 3))
     ends[..., right], ends[..., up] = positions[right][:, None], positions[up]
     ends[0, ..., axis], ends[1, ..., axis] = box[:, axis] + [-1.0, 1.0]
-    from ..projector.tracing import trace_rays  # slow to import, and not needed to list figures
+    from ..rays.tracing import trace_rays  # slow to import, and not needed to list figures
 
     sums = trace_rays(volume, ends[0].reshape(-1, 3), ends[1].reshape(-1, 3))
     return np.asarray(sums, np.float32).reshape(n_pixels[right], n_pixels[up]), box

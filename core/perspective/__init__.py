@@ -5,6 +5,6 @@ Entry points: `PerspectiveGrid` with `to_perspective` and `from_perspective` (a 
 from its pixels) and `backproject` (a volume from all images, without a model). The equations are in docs/perspective.md.
 
 To add a way of combining the views of a voxel, add a row to `HOW` in backprojection.py, its number in places.py, and its
-case in the C kernel (core/projector/backends/kernels) as in its numpy twin, `_gather_in_numpy`. To add a relation of
+case in the C kernel (core/rays/backends/kernels) as in its numpy twin, `_gather_in_numpy`. To add a relation of
 rays, start from `view_rays`, which covers pinhole and parallel views with any pixel steps.
 """

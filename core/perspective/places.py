@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 
 from ..arrays import Array, Floats
 from ..progress import Progress, tell
-from ..projector.parallel import in_order, thread_count
+from ..rays.parallel import in_order, thread_count
 
 try:
-    from ..projector.backends.cpu import gather as _gather_kernel
-    from ..projector.backends.cpu import scatter as _scatter_kernel
+    from ..rays.backends.cpu import gather as _gather_kernel
+    from ..rays.backends.cpu import scatter as _scatter_kernel
 except (ImportError, OSError):  # this platform has no kernels
     _gather_kernel = _scatter_kernel = None  # type: ignore[assignment]
 

@@ -11,12 +11,12 @@ from ..errors import InputError, warn
 from ..geometry.grid import Grid
 from ..memory import require
 from ..progress import Progress, part_of, tell
-from ..projector import backends
-from ..projector.bundles import Beam, Bundle, Bundles
-from ..projector.execution import Execution
-from ..projector.linear_operator import LinearOperator
-from ..projector.parallel import thread_count
-from ..projector.rays import Fan
+from ..rays import backends
+from ..rays.bundles import Beam, Bundles, RayBundle
+from ..rays.execution import Execution
+from ..rays.linear_operator import LinearOperator
+from ..rays.parallel import thread_count
+from ..rays.ray_geometry import Fan
 from ..validation import instance, one_of
 from ..volumes.volume import UNITS, Volume, require_quantity
 from .perspective_grid import PerspectiveGrid
@@ -258,14 +258,14 @@ class _RayMeans(_LatticeMap):
         float64 = backend.always_float64 or array.dtype == np.float64
         return Execution(backend, self.source, None, float64, thread_count(None))
 
-    def _bundle(self, plane: int) -> Bundle:
+    def _bundle(self, plane: int) -> RayBundle:
         """Return the rays of one plane's cells, from their front to their back plane, in the order of columns."""
         edges = self.target.edges[plane : plane + 2]
         corners = np.array([[[0, 0, k], [1, 0, k], [0, 1, k]] for k in edges], np.float64)
         (start, next_start, _), (end, next_end, row_end) = self.target.to_world(corners)
         spacing_ratio = float(np.linalg.norm(next_start - start) / np.linalg.norm(next_end - end))
         fan = Fan(start, end, next_end - end, row_end - end, self.shape_out[:2], parallel=spacing_ratio)
-        return Bundle.along(self.source, Beam(fan))
+        return RayBundle.along(self.source, Beam(fan))
 
 
 class _CellMeans(_LatticeMap):

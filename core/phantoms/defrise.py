@@ -1,4 +1,4 @@
-"""The Defrise phantom: hot disks across the axis, which show where data along the axis are missing."""
+"""The Defrise phantom: hot disks perpendicular to the axis, which show where data along the axis are missing."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -20,14 +20,14 @@ class DefrisePhantom(Phantom):
     and Biology 45 (2000) 623-643. By default it fills a ball of 75 mm radius.
     """
 
-    disks: int = count(7, "how many")
-    disk_radius: float = setting(50.0, "mm", "of the disks")
-    disk_thickness: float = setting(8.0, "mm", "of the disks")
-    spacing: float = setting(16.0, "mm", "from disk to disk, middle to middle", option="spacing-of-disks")
-    margin: float = setting(5.0, "mm", "of water around the disks; 0 for none", 0.0)
-    activity: float = setting(100.0, "kBq/mL", "of the disks", 0.0)
-    background: float = setting(0.0, "kBq/mL", "of the water", 0.0)
-    mu: float = setting(WATER_MU, "1/mm", "of all of it", 0.0)
+    disks: int = count(7, "number of disks")
+    disk_radius: float = setting(50.0, "mm", "radius of the disks")
+    disk_thickness: float = setting(8.0, "mm", "thickness of the disks")
+    spacing: float = setting(16.0, "mm", "distance between the centres of adjacent disks", option="spacing-of-disks")
+    margin: float = setting(5.0, "mm", "thickness of the water around the disks; 0 for none", 0.0)
+    activity: float = setting(100.0, "kBq/mL", "activity of the disks", 0.0)
+    background: float = setting(0.0, "kBq/mL", "activity of the water", 0.0)
+    mu: float = setting(WATER_MU, "1/mm", "attenuation coefficient of disks and water", 0.0)
 
     title = "Defrise phantom"
 
@@ -38,7 +38,7 @@ class DefrisePhantom(Phantom):
 
     @cached_property
     def shapes(self) -> Sequence[Shape]:
-        """Water, if there is any, and the disks from -z to +z."""
+        """Cylinder of water, if the margin is above 0, and the disks from -z to +z."""
         height = (self.disks - 1) * self.spacing + self.disk_thickness
         shapes: list[Shape] = []
         if self.margin:

@@ -1,4 +1,4 @@
-"""The kinds of phantoms, one line each; command line and Blender follow from this table and from the classes' fields.
+"""Table of the kinds of phantoms; command line, recipes and Blender follow from it and from the classes' fields.
 
 A new kind is a file with its dataclass, whose fields are made by `settings.setting`, `count` and `choice`, and a line here.
 """
@@ -17,25 +17,32 @@ from .shepp_logan import SheppLogan
 from .torso import CardiacTorso
 
 
-class Kind(NamedTuple):
-    """One kind of phantom."""
+class PhantomKind(NamedTuple):
+    """Kind of phantom: its class, and its names and texts for users."""
 
-    name: str  # on the command line
-    phantom: Any  # its class
-    label: str  # in menus
-    summary: str  # one line of help
-    example: str = ""  # options on the command line
-    usual: Mapping[str, float] = MappingProxyType({})  # settings where Blender does not begin with the class's default
+    name: str
+    """Name on the command line and in recipes."""
+    phantom: Any
+    """Class of the phantom, a dataclass derived from `Phantom`."""
+    label: str
+    """Name in Blender's menus."""
+    summary: str
+    """Noun phrase for help texts and tooltips, with its article."""
+    example: str = ""
+    """Options of the example in the command's help."""
+    usual: Mapping[str, float] = MappingProxyType({})
+    """Initial values in Blender and in recipes that differ from the class's defaults, by field."""
 
 
 _HOT = {"activity": 100.0}
 KINDS = (
-    Kind("derenzo", DerenzoPhantom, "Derenzo", "a Derenzo phantom: sectors of hot rods", "--rods 8 6 5 4 3 2", _HOT),
-    Kind("nema", NemaBody, "NEMA Body", "the NEMA (IEC) body phantom: six spheres", "--sphere-activity 40"),
-    Kind("jaszczak", JaszczakPhantom, "Jaszczak", "a Jaszczak phantom: rods and spheres", "--activity 50"),
-    Kind("defrise", DefrisePhantom, "Defrise", "a Defrise phantom: hot disks", "--disks 7 --spacing-of-disks 12"),
-    Kind("shepp-logan", SheppLogan, "Shepp-Logan Head", "the 3-D Shepp-Logan head", "--contrast original"),
-    Kind("points", PointGrid, "Point Grid", "a grid of point sources", "--counts 3 3 3 --spacing-of-points 30 30 30"),
-    Kind("mixture", MixturePhantom, "Mixture", "random shapes, other ones for each seed", "--number 12"),
-    Kind("torso", CardiacTorso, "Cardiac Torso", "a cardiac torso", "--defect-severity 0.5 --defect-angle-degrees 90"),
-)
+    PhantomKind("derenzo", DerenzoPhantom, "Derenzo", "a Derenzo phantom: sectors of hot rods", "--rods 8 6 5 4 3 2", _HOT),
+    PhantomKind("nema", NemaBody, "NEMA Body", "the NEMA (IEC) body phantom: six spheres", "--sphere-activity 40"),
+    PhantomKind("jaszczak", JaszczakPhantom, "Jaszczak", "a Jaszczak phantom: rods and spheres", "--activity 50"),
+    PhantomKind("defrise", DefrisePhantom, "Defrise", "a Defrise phantom: hot disks", "--disks 7 --spacing-of-disks 12"),
+    PhantomKind("shepp-logan", SheppLogan, "Shepp-Logan Head", "the 3-D Shepp-Logan head", "--contrast original"),
+    PhantomKind("points", PointGrid, "Point Grid", "a grid of point sources", "--counts 3 3 3 --spacing-of-points 30 30 30"),
+    PhantomKind("mixture", MixturePhantom, "Mixture", "random shapes, different for each seed", "--number 12"),
+    PhantomKind("torso", CardiacTorso, "Cardiac Torso", "a cardiac torso",
+                "--defect-severity 0.5 --defect-angle-degrees 90"),
+)  # fmt: skip

@@ -1,4 +1,4 @@
-"""Phantoms as text: a TOML file of shapes, in the order of painting.
+"""Phantoms as text: TOML files that list shapes in the order of painting.
 
 ::
 
@@ -8,7 +8,7 @@
     [[shape]]                          # painted first
     kind = "cylinder"
     name = "water"
-    radius = 100                       # mm; [165, 115] for an elliptic one
+    radius = 100                       # mm; [165, 115] for an ellipse
     height = 200
     activity = 5                       # kBq/mL
     mu = 0.0154                        # 1/mm
@@ -40,23 +40,23 @@ from .shapes import Box, Capsule, Cone, Cylinder, Ellipsoid, Shape, Sphere
 SHAPES: dict[str, type[Shape]] = {
     shape.KIND: shape for shape in (Box, Capsule, Cone, Cylinder, DerenzoRods, Ellipsoid, Sphere)
 }
-"""The shapes by the names of their kinds."""
+"""Classes of shapes by the name of their kind."""
 
 _EULER = "euler_degrees"
 
 
 def read_phantom(path: AnyPath) -> ShapePhantom:
-    """The phantom that a TOML file describes, see `core.phantoms.language`; messages name file, shape and key."""
-    return _phantom(read_toml(path), str(path))
+    """Read a phantom from a TOML file, see `core.phantoms.language`; messages name file, shape and key."""
+    return _make_phantom(read_toml(path), str(path))
 
 
 def parse_phantom(text: str, name: str = "phantom") -> ShapePhantom:
-    """The phantom that a text in TOML describes, see `read_phantom`; messages call the text `name`."""
-    return _phantom(parse_toml(text, name), name)
+    """Return the phantom that a text in TOML describes, see `read_phantom`; messages call the text `name`."""
+    return _make_phantom(parse_toml(text, name), name)
 
 
 def write_phantom(phantom: Phantom, path: AnyPath) -> None:
-    """Write the shapes of any phantom as a .toml file; `read_phantom` gives the same shapes back."""
+    """Write the shapes of any phantom to a .toml file, from which `read_phantom` reads the same shapes."""
     instance(phantom, Phantom, "write_phantom")
     require_ending(path, (".toml",))
     lines = [f"name = {toml_value(phantom.title)}", f"mu_energy = {toml_value(phantom.mu_energy)}"]
@@ -71,25 +71,27 @@ def write_phantom(phantom: Phantom, path: AnyPath) -> None:
     write_bytes(path, "\n".join([*lines, ""]).encode())
 
 
-def _phantom(table: dict[str, Any], name: str) -> ShapePhantom:
+def _make_phantom(table: dict[str, Any], name: str) -> ShapePhantom:
+    """Return the phantom that a parsed TOML table describes; messages begin with `name`."""
     with naming(name):
-        _refuse_unknown(table, ("name", "mu_energy", "shape"))
-        shapes = table.get("shape", [])
-        if not isinstance(shapes, list) or not shapes or not all(isinstance(shape, dict) for shape in shapes):
+        _check_keys(table, ("name", "mu_energy", "shape"))
+        tables = table.get("shape", [])
+        if not isinstance(tables, list) or not tables or not all(isinstance(entries, dict) for entries in tables):
             raise InputError("expected one [[shape]] or more")
-        made = [_shape(i, entries) for i, entries in enumerate(shapes, 1)]
-        return ShapePhantom(made, table.get("name", ""), table.get("mu_energy", ShapePhantom.mu_energy))
+        shapes = [_make_shape(i, entries) for i, entries in enumerate(tables, 1)]
+        return ShapePhantom(shapes, table.get("name", ""), table.get("mu_energy", ShapePhantom.mu_energy))
 
 
-def _shape(number: int, given: dict[str, Any]) -> Shape:
-    name = given.get("name", "")
+def _make_shape(number: int, table: dict[str, Any]) -> Shape:
+    """Return the shape of a [[shape]] table; messages begin with its number, from 1, and its name."""
+    name = table.get("name", "")
     with naming(f"shape {number}{f' {name!r}' if name else ''}"):
-        entries = dict(given)
+        entries = dict(table)
         kind = entries.pop("kind", None)
         if not isinstance(kind, str) or kind not in SHAPES:
             raise InputError(f"kind: expected one of {', '.join(SHAPES)}, got {kind!r}")
         fields = [field for field in dataclasses.fields(SHAPES[kind]) if field.init]
-        _refuse_unknown(entries, [_EULER if field.name == "euler" else field.name for field in fields])
+        _check_keys(entries, [_EULER if field.name == "euler" else field.name for field in fields])
         for field in fields:
             if field.default is dataclasses.MISSING and field.name not in entries:
                 raise InputError(f"{field.name}: missing; a {kind} needs one")
@@ -101,20 +103,22 @@ def _shape(number: int, given: dict[str, Any]) -> Shape:
         return SHAPES[kind](**entries)
 
 
-def _refuse_unknown(table: dict[str, Any], known: Iterable[str]) -> None:
+def _check_keys(table: dict[str, Any], allowed: Iterable[str]) -> None:
+    """Raise `InputError` for a key that is not allowed, or a value that contains true or false."""
     for key, value in table.items():
-        if key not in known:
-            raise InputError(f"{key}: no such key; expected {', '.join(known)}")
-        if _has_boolean(value):  # to numpy they are numbers
+        if key not in allowed:
+            raise InputError(f"{key}: no such key; expected {', '.join(allowed)}")
+        if _has_boolean(value):  # numpy would take it as a number
             raise InputError(f"{key}: expected numbers or a text, got true or false")
 
 
 def _has_boolean(value: Any) -> bool:
+    """Return whether a value of TOML is, or a list contains, true or false."""
     return isinstance(value, bool) or (isinstance(value, list) and any(map(_has_boolean, value)))
 
 
 def _degrees(angle: float) -> float:
-    """Degrees that convert back to exactly `angle`, radians; plain conversion may change the last digit."""
+    """Return the `angle`, rad, in degrees that convert back to exactly it; plain conversion may change the last digit."""
     degrees = math.degrees(angle)
     candidates = (degrees, float(np.nextafter(degrees, np.inf)), float(np.nextafter(degrees, -np.inf)))
     return next((candidate for candidate in candidates if math.radians(candidate) == angle), degrees)

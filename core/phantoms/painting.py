@@ -1,7 +1,7 @@
-"""Shapes painted one over the other: the mean over each voxel, the values at points, the integrals along lines.
+"""Painting of shapes one over the other: voxel means, values at points and line integrals of the result.
 
-Each shape changes what the shapes before it left only inside itself. A voxel's mean is therefore the sum, over the
-shapes, of the mean of that change, and each shape is sampled as finely as its own size asks.
+A layer changes the values of the layers beneath it only inside its own shape. The mean over a voxel is therefore the sum,
+over all layers, of the mean of that change, and each shape is sampled as finely as its own size requires.
 """
 
 from collections.abc import Iterator, Sequence
@@ -22,25 +22,29 @@ from .shapes import Shape
 Points = Floats
 Indices = Integers
 
-# Points of one call of a shape's `distance`: few enough that its temporaries stay in the processor's cache.
+# Points per call of a shape's `distance`: few enough that its temporaries stay in the processor's cache.
 _BLOCK = 1 << 15
-_MIN_SAMPLES, _MAX_SAMPLES = 128, 1 << 13  # of a voxel that a surface cuts
-_CELLS = 64  # of a voxel that is longer than wide, unless fewer are about cubes
-_SEQUENCE = 1 << 16  # points that voxels take their samples from, each another stretch, so that their errors cancel
-# Over several values beneath, few voxels get more samples: about so many altogether.
+# Sample points per voxel, or per cell of a voxel, that a surface cuts.
+_MIN_SAMPLES, _MAX_SAMPLES = 128, 1 << 13
+# Cells per voxel of a long voxel, unless fewer are already about cubes.
+_CELLS = 64
+# Points in the sequence from which voxels take their samples, each voxel another stretch, so that their errors cancel.
+_SEQUENCE = 1 << 16
+# Sample points of a layer over several values: where few voxels are cut, each gets more samples, about this many in all.
 _SAMPLES_OF_MIXED = 1 << 21
-# A shape that fills no voxel and touches at most `_FEW` of them is sampled in its own box.
+# A shape that fills no voxel and touches at most `_FEW` voxels is sampled in its own box instead of in voxels.
 _FEW = 1 << 11
-_SAMPLES_OF_FEW = 1 << 10  # per voxel
-_BOX_BLOCK = 1 << 13  # points at a time
-_SAMPLES_OF_OVERLAP = 1 << 18
-_ROUNDING = 1e-6  # of a voxel
-_RAYS, _PARTS = 1 << 14, 256  # at a time; fewer rays where a shape has more parts
+_SAMPLES_OF_FEW = 1 << 10  # points in the box of such a shape, per touched voxel
+_BOX_BLOCK = 1 << 13  # points of one block in a shape's box
+_SAMPLES_OF_OVERLAP = 1 << 18  # points in a shape's box at which its overlap with other shapes is measured
+_ROUNDING = 1e-6  # distance, in voxels, by which a shape in the grid may extend beyond it
+# Lines integrated at a time; fewer for shapes of more than `_PARTS` parts.
+_RAYS, _PARTS = 1 << 14, 256
 
 
 @dataclass(frozen=True, eq=False)
 class Layer:
-    """One shape of a painting, its world-from-shape `pose` (4, 4), mm, and the `value` it holds."""
+    """Shape of a painting with its pose world-from-shape (4, 4), mm, and its value, an activity or a mu."""
 
     shape: Shape
     pose: Points
@@ -48,128 +52,130 @@ class Layer:
 
     @property
     def adds(self) -> bool:
-        """Whether the value is added to what is beneath instead of replacing it."""
+        """Whether the value is added to the values beneath instead of replacing them."""
         return self.shape.mode == "add"
 
     @cached_property
     def from_world(self) -> Points:
-        """Shape-from-world (4, 4)."""
+        """Inverse of the pose, shape-from-world (4, 4)."""
         return np.linalg.inv(self.pose)
 
     @cached_property
     def volume(self) -> float:
-        """mm^3 in the world."""
+        """Volume of the shape in the world, mm^3."""
         return self.shape.volume * abs(float(np.linalg.det(self.pose[:3, :3])))
 
     def contains(self, points: Points) -> Bools:
-        """Which of the world `points` (3, N), mm, lie inside."""
-        return self.shape.distance(_moved(self.from_world, points)) < 0
+        """Return whether each of the world `points` (3, N), mm, lies inside the shape, (N,)."""
+        return self.shape.distance(_transform(self.from_world, points)) < 0
 
-    def over(self, values: Array) -> Array:
-        """The values after painting this layer over `values`."""
+    def paint_over(self, values: Array) -> Array:
+        """Return the `values` at points inside the shape after this layer is painted over them."""
         value = values.dtype.type(self.value)
         return values + value if self.adds else np.full_like(values, value)
 
-    def relation(self, other: "Layer") -> int:
-        """1 if the shape certainly contains the other's, -1 if they certainly do not touch, 0 otherwise."""
-        from_other = self.from_world @ other.pose
-        radius = other.shape.ball_radius * float(np.linalg.norm(from_other[:3, :3], 2))
-        distance = float(self.shape.distance(from_other[:3, 3:])[0])
+    def relation(self, layer: "Layer") -> int:
+        """Return 1 if this shape certainly contains the `layer`'s, -1 if the two certainly do not touch, else 0."""
+        from_layer = self.from_world @ layer.pose
+        radius = layer.shape.ball_radius * float(np.linalg.norm(from_layer[:3, :3], 2))
+        distance = float(self.shape.distance(from_layer[:3, 3:])[0])
         return 1 if distance < -radius else -1 if distance > radius else 0
 
 
 def values_at(layers: Sequence[Layer], points: Points) -> Points:
-    """The painting's values (N,) at world `points` (3, N), mm."""
+    """Return the painting's values (N,) at world `points` (3, N), mm; `layers` run from bottom to top."""
     values = np.zeros(points.shape[1])
     for layer in layers:
-        values = np.where(layer.contains(points), layer.over(values), values)
+        values = np.where(layer.contains(points), layer.paint_over(values), values)
     return values
 
 
 def points_inside(layer: Layer) -> Iterator[Points]:
-    """World points (3, n) that fill a layer's shape evenly, block by block."""
+    """Yield world points (3, n), mm, that fill a layer's shape evenly, block by block."""
     for first in range(0, _SAMPLES_OF_OVERLAP, _BOX_BLOCK):
-        yield _moved(layer.pose, _shape_points(layer.shape, first))
+        yield _transform(layer.pose, _shape_points(layer.shape, first))
 
 
 def mean_changes(layers: Sequence[Layer]) -> list[float]:
-    """By how much painting each layer changes, on average over its shape, what the layers beneath it left there.
+    """Return each layer's mean change of value over its own volume when painted over the layers beneath it.
 
-    The overlap of two layers is counted at points of the smaller one. Errors are therefore small beside the content of
-    either, and nothing remains of a layer that is covered completely.
+    The overlap of two layers is measured at points of the smaller one. Errors are therefore small compared with the content
+    of either, and the content of a layer that is covered completely vanishes completely.
     """
     changes = [layer.value for layer in layers]
     for number, layer in enumerate(layers):
-        for other, share in _overlaps(layers, number).items():
-            upper, lower = max(number, other), min(number, other)
-            changes[upper] -= share * layer.volume * layers[lower].value / layers[upper].volume
+        for k, fraction in _overlaps(layers, number).items():
+            upper, lower = max(number, k), min(number, k)
+            changes[upper] -= fraction * layer.volume * layers[lower].value / layers[upper].volume
     return changes
 
 
 def _overlaps(layers: Sequence[Layer], number: int) -> dict[int, float]:
-    """Shares of one layer's volume: for each larger layer above, what it is the first to cover; for each larger layer
-    beneath, what this layer covers of it as the first.
+    """Return fractions of the volume of layer `number`, by the numbers of the larger layers that it overlaps.
+
+    For a layer above, it is the fraction in which that layer is the first to replace this one; for a layer beneath, the
+    fraction in which that layer's value is visible before this one is painted. Overlaps of a lower value 0 are left out.
     """
     layer = layers[number]
-    relations = {k: other.relation(layer) for k, other in enumerate(layers) if k != number}
+    relations = {k: candidate.relation(layer) for k, candidate in enumerate(layers) if k != number}
     above = [k for k, relation in relations.items() if k > number and relation >= 0 and not layers[k].adds]
     beneath = [k for k, relation in relations.items() if k < number and relation >= 0 and not layer.adds][::-1]
     larger = [k for k in (*above, *beneath) if (layers[k].volume, k) > (layer.volume, number)]
-    counted = {k: 0 for k in larger if layers[min(k, number)].value}
-    if not counted:
+    n_overlapping = {k: 0 for k in larger if layers[min(k, number)].value}
+    if not n_overlapping:
         return {}
-    sampled = any(relations[k] == 0 for k in (*above, *beneath))
-    hits = 0
+    is_partial = any(relations[k] == 0 for k in (*above, *beneath))
+    n_points = 0
     for points in points_inside(layer):
-        hits += points.shape[1]
+        n_points += points.shape[1]
         for order in (above, beneath):
-            free = points
+            uncovered = points
             for k in order:
-                inside = np.ones(free.shape[1], bool) if relations[k] else layers[k].contains(free)
-                if k in counted:
-                    counted[k] += int(np.count_nonzero(inside))
+                inside = np.ones(uncovered.shape[1], bool) if relations[k] else layers[k].contains(uncovered)
+                if k in n_overlapping:
+                    n_overlapping[k] += int(np.count_nonzero(inside))
                 if not layers[k].adds:
-                    free = free[:, ~inside]
-        if hits and not sampled:  # any points tell
+                    uncovered = uncovered[:, ~inside]
+        if n_points and not is_partial:  # all layers contain this one: every point gives the same answer
             break
-    return {k: count / max(hits, 1) for k, count in counted.items()}
+    return {k: n / max(n_points, 1) for k, n in n_overlapping.items()}
 
 
-def _seen_beneath(layers: Sequence[Layer]) -> list[list[Layer]]:
-    """For each layer, those below it that may show in its shape, if it replaces what is beneath it."""
+def _visible_layers(layers: Sequence[Layer]) -> list[list[Layer]]:
+    """Return for each layer the layers beneath it that may be visible inside its shape; none for a layer that adds."""
     centers = np.array([layer.pose[:3, 3] for layer in layers]).reshape(-1, 3)
     radii = np.array([layer.shape.ball_radius * np.linalg.norm(layer.pose[:3, :3], 2) for layer in layers])
     result = []
     for i, layer in enumerate(layers):
         near = np.linalg.norm(centers[:i] - centers[i], axis=1) < radii[:i] + radii[i]
-        seen: list[Layer] = []
+        visible: list[Layer] = []
         for j in np.flatnonzero(near).tolist() if not layer.adds else ():
             relation = layers[j].relation(layer)
             if relation == 1 and not layers[j].adds:
-                seen = []
+                visible = []
             if relation >= 0:
-                seen.append(layers[j])
-        result.append(seen)
+                visible.append(layers[j])
+        result.append(visible)
     return result
 
 
 def paint_voxels(
     grid: Grid, layers: Sequence[Layer], changes: Sequence[float], progress: Progress | None = None
 ) -> Floats32:
-    """The mean of the painting over each voxel, float32 array of the grid's shape.
+    """Return the mean of the painting over each voxel, a float32 array of the grid's shape.
 
-    A voxel farther from a surface than its own half diagonal lies inside or outside as a whole. Of the others, the share
-    that a shape covers is counted at points of a low-discrepancy sequence, in long voxels cell by cell; the shares are then
-    corrected so that the total change is the known one. For a shape that is small beside the voxels, the points fill the
-    shape instead.
+    `layers` run from bottom to top; `changes` are their `mean_changes`; `progress` is called with (done, total).
 
-    `layers` run from bottom to top; `changes` are those of `mean_changes`; `progress` is called with (done, total).
+    A voxel farther from a surface than its own half diagonal lies completely inside or outside. For all other voxels, the
+    fraction that a shape covers is estimated at points of a low-discrepancy sequence, in long voxels cell by cell. The
+    fractions are then corrected so that the layer's total change equals its mean change times its volume. For a shape that
+    is small compared with the voxels, the points fill the shape instead.
     """
     require(5.0 * grid.n_voxels, "a volume of {} x {} x {} voxels".format(*grid.shape))
     image = np.zeros(grid.shape, np.float32)
-    limits = _limits(layers)
-    painted = zip(layers, _seen_beneath(layers), changes, strict=True)
-    strokes = [stroke for each in painted if (stroke := _Stroke(grid, *each, limits)).blocks]
+    limits = _value_limits(layers)
+    painted = zip(layers, _visible_layers(layers), changes, strict=True)
+    strokes = [stroke for arguments in painted if (stroke := _Stroke(grid, *arguments, limits)).blocks]
     total, done = sum(len(stroke.blocks) for stroke in strokes), 0
     with ThreadPoolExecutor(cores()) as pool:
         for stroke in strokes:
@@ -180,8 +186,8 @@ def paint_voxels(
     return np.clip(image, *limits, out=image)
 
 
-def _limits(layers: Sequence[Layer]) -> tuple[float, float]:
-    """The smallest and the largest value that painting these layers can leave."""
+def _value_limits(layers: Sequence[Layer]) -> tuple[float, float]:
+    """Return the smallest and the largest value that a painting of these layers can have."""
     values = [0.0, *(layer.value for layer in layers)]
     if min(values) < 0:
         return -np.inf, np.inf
@@ -189,246 +195,294 @@ def _limits(layers: Sequence[Layer]) -> tuple[float, float]:
 
 
 class _Stroke:
-    """Painting one layer over those beneath it."""
+    """Painting of one layer into voxels, over the layers beneath it.
+
+    Attributes
+    ----------
+    start, stop : (3,)
+        First index, and last index + 1, of the box of voxels that contains the shape.
+    blocks : range
+        First numbers of the blocks of work: voxels of the box, or points if the shape is small.
+    is_small : bool
+        Whether `paint_points` is to be used instead of `paint_cells`.
+    is_in_grid : bool
+        Whether the whole shape lies in the grid.
+    volume : float
+        Volume of the shape, in voxels.
+    levels : list of (3,)
+        Numbers of cells of a voxel along its axes, from the whole voxel to the finest division.
+    n_samples : int
+        Sample points per cell of the finest division.
+    """
 
     def __init__(
         self, grid: Grid, layer: Layer, beneath: Sequence[Layer], mean_change: float, limits: tuple[float, float]
     ) -> None:
+        """Choose the voxels, the method and the numbers of samples.
+
+        `beneath` are the visible layers beneath, `mean_change` is the layer's of `mean_changes`, `limits` are the smallest
+        and the largest value that a voxel can have.
+        """
         self.grid, self.layer, self.beneath, self.mean_change, self.limits = grid, layer, beneath, mean_change, limits
         shape, shape_from_index = layer.shape, layer.from_world @ grid.affine
-        # Bounds of the indices of the shape's points: the tighter of its box and its ball.
+        # Bounds of the shape's voxel indices: the tighter ones of its box and its ball.
         index_from_shape = np.linalg.inv(shape_from_index)
-        linear, middle = index_from_shape[:3, :3], index_from_shape[:3, 3]
+        linear, center = index_from_shape[:3, :3], index_from_shape[:3, 3]
         half = np.minimum(np.abs(linear) @ shape.half_box, np.linalg.norm(linear, axis=1) * shape.ball_radius)
-        low, high = middle - half, middle + half
+        low, high = center - half, center + half
         # Clipped as floats: a far-away box must not overflow the integers.
         self.start = np.clip(np.floor(low + 0.5), 0, grid.shape).astype(np.int64)
         self.stop = np.clip(np.floor(high + 0.5) + 1, self.start, grid.shape).astype(np.int64)
         n_voxels = int(np.prod(self.stop - self.start))
-        self.in_grid = bool(np.all(np.maximum(-0.5 - low, high + 0.5 - grid.shape) < _ROUNDING))
-        self.in_voxels = shape.volume / abs(float(np.linalg.det(shape_from_index[:3, :3])))  # the shape's volume
-        narrowest = 1 / float(np.linalg.norm(linear, axis=1).max())  # of the voxels' widths
-        # The voxels in the shape's box or, where it lies across them, cubes of that width in it.
-        touched = float(min(np.prod(2 * half + 1), np.prod(2 * np.array(shape.half_box) / narrowest + 1)))
-        fills_none = self.in_voxels < 1 or 2 * min(shape.half_box) < narrowest
-        self.is_small = fills_none and touched < _FEW
-        # What the shape covers is mixed unless one layer surely lies beneath all of it.
+        self.is_in_grid = bool(np.all(np.maximum(-0.5 - low, high + 0.5 - grid.shape) < _ROUNDING))
+        self.volume = shape.volume / abs(float(np.linalg.det(shape_from_index[:3, :3])))
+        voxel_width = 1 / float(np.linalg.norm(linear, axis=1).max())  # mm, the smallest one
+        # Voxels in the shape's box of indices or, if the voxels lie obliquely to it, cubes of that width in its own box.
+        n_touched = float(min(np.prod(2 * half + 1), np.prod(2 * np.array(shape.half_box) / voxel_width + 1)))
+        fills_no_voxel = self.volume < 1 or 2 * min(shape.half_box) < voxel_width
+        self.is_small = fills_no_voxel and n_touched < _FEW
+        # The values beneath are mixed unless one layer certainly lies beneath all of the shape.
         is_mixed = len(beneath) > 1 or (len(beneath) == 1 and beneath[0].relation(layer) != 1)
         if self.is_small:
-            points = _SAMPLES_OF_FEW * max(touched, 8.0)
-            if is_mixed or not self.in_grid:
-                points = max(points, min(8 * points, _SAMPLES_OF_MIXED))
-            self.blocks = range(0, int(points) if n_voxels else 0, _BOX_BLOCK)
+            n_points = _SAMPLES_OF_FEW * max(n_touched, 8.0)
+            if is_mixed or not self.is_in_grid:
+                n_points = max(n_points, min(8 * n_points, _SAMPLES_OF_MIXED))
+            self.blocks = range(0, int(n_points) if n_voxels else 0, _BOX_BLOCK)
             return
         self.blocks = range(0, n_voxels, min(max(n_voxels >> 6, 1 << 10), _BLOCK))
-        # A long voxel is halved and halved again, until its cells are about cubes, or many and finer than the shape.
+        # A long voxel is halved repeatedly until its cells are about cubes, or numerous and finer than the shape.
         edges, self.levels = np.linalg.norm(shape_from_index[:3, :3], axis=0), [np.ones(3, np.int64)]
-        while (cell := edges / (parts := self.levels[-1])).max() > 2 * cell.min() and (
-            cell.max() > shape.finest / 2 or parts.prod() < _CELLS
+        while (cell := edges / (divisions := self.levels[-1])).max() > 2 * cell.min() and (
+            cell.max() > shape.finest / 2 or divisions.prod() < _CELLS
         ):
-            self.levels.append(parts * np.where(cell > cell.max() / 2, 2, 1))
-        n_cells, ratio = int(parts.prod()), float(cell.max()) / shape.finest
+            self.levels.append(divisions * np.where(cell > cell.max() / 2, 2, 1))
+        n_cells, ratio = int(divisions.prod()), float(cell.max()) / shape.finest
         # The errors of a voxel's cells cancel.
-        samples = _MIN_SAMPLES * max(1.0, 4 * ratio) / min(n_cells, 4 * _CELLS) ** 0.5
+        n_samples = _MIN_SAMPLES * max(1.0, 4 * ratio) / min(n_cells, 4 * _CELLS) ** 0.5
         if is_mixed or n_cells > 1:
-            samples = max(samples, _SAMPLES_OF_MIXED / (touched * n_cells))
-        if not self.in_grid:
-            # No known total corrects the shares c. With n samples their errors are about n^(-2/3) / 2. A surface below
-            # 6 V / s, s being the smallest part, cuts some 9 V h / (s v) cells of the volume v and the length h: this n
-            # keeps the sum of their random errors below 1/5000 of V.
-            samples = max(samples, (7500 * float(np.sqrt(ratio / (self.in_voxels * n_cells)))) ** 1.5)
-        self.n_samples = int(min(samples, _MAX_SAMPLES))
+            n_samples = max(n_samples, _SAMPLES_OF_MIXED / (n_touched * n_cells))
+        if not self.is_in_grid:
+            # No total is known that could correct the covered fractions. With n samples their errors are about
+            # n^(-2/3) / 2. A surface of area below 6 V / s (volume V, smallest part s) cuts about 9 V h / (s v) cells of
+            # volume v and length h: this n keeps the sum of their random errors below 1/5000 of V.
+            n_samples = max(n_samples, (7500 * float(np.sqrt(ratio / (self.volume * n_cells)))) ** 1.5)
+        self.n_samples = int(min(n_samples, _MAX_SAMPLES))
 
     def paint_points(self, box: Floats32, pool: ThreadPoolExecutor) -> Iterator[None]:
-        """Points of the shape, each with an equal share of its volume, are added to the voxels that they fall into.
+        """Add points of the shape, each an equal share of its volume, to the voxels of `box` that contain them.
 
-        What they replace is scaled so that the shape's total change is the known one.
+        The values that they replace are scaled so that the shape's total change is its mean change times its volume.
+        Yields after each block.
         """
-        inside, replaced = np.zeros((2, *box.shape))
-        hits, replaced_in_all = 0, 0.0
+        n_inside, replaced = np.zeros((2, *box.shape))
+        n_points, replaced_sum = 0, 0.0
         index_from_shape = np.linalg.inv(self.grid.affine) @ self.layer.pose
 
         def sample(first: int) -> tuple[Indices, Points]:
+            """Return the voxel indices (3, n) of a block's points, and the values (n,) beneath."""
             points = _shape_points(self.layer.shape, first)
-            beneath = values_at(self.beneath, _moved(self.layer.pose, points))
-            return np.rint(_moved(index_from_shape, points)).astype(np.int64), beneath
+            values_beneath = values_at(self.beneath, _transform(self.layer.pose, points))
+            return np.rint(_transform(index_from_shape, points)).astype(np.int64), values_beneath
 
-        for index, beneath in pool.map(sample, self.blocks):
-            hits += len(beneath)
-            replaced_in_all += float(beneath.sum())
+        for index, values_beneath in pool.map(sample, self.blocks):
+            n_points += len(values_beneath)
+            replaced_sum += float(values_beneath.sum())
             index -= self.start[:, None]
-            held = np.all((index >= 0) & (index < np.array(box.shape)[:, None]), axis=0)
-            place = tuple(index[:, held])
-            np.add.at(inside, place, 1)
-            np.add.at(replaced, place, beneath[held])
+            in_box = np.all((index >= 0) & (index < np.array(box.shape)[:, None]), axis=0)
+            voxels = tuple(index[:, in_box])
+            np.add.at(n_inside, voxels, 1)
+            np.add.at(replaced, voxels, values_beneath[in_box])
             yield
-        known = (self.layer.value - self.mean_change) * hits
-        scale = known / replaced_in_all if replaced_in_all else 1.0
-        box += (self.layer.value * inside - scale * replaced) * (self.in_voxels / max(hits, 1))
+        true_sum = (self.layer.value - self.mean_change) * n_points
+        scale = true_sum / replaced_sum if replaced_sum else 1.0
+        box += (self.layer.value * n_inside - scale * replaced) * (self.volume / max(n_points, 1))
 
     def paint_cells(self, box: Floats32, pool: ThreadPoolExecutor) -> Iterator[None]:
-        """Voxels inside the shape are filled; those that its surface cuts are sampled."""
-        stretches = max(1, _SEQUENCE // self.n_samples)
-        offsets = (_r3_sequence(stretches * self.n_samples) - 0.5).reshape(3, stretches, self.n_samples)
-        layers = [_Sampled(layer, self.grid, self.levels, offsets) for layer in (self.layer, *self.beneath)]
+        """Fill the voxels of `box` that lie inside the shape, and sample those that its surface may cut.
+
+        Yields after each block.
+        """
+        n_stretches = max(1, _SEQUENCE // self.n_samples)
+        offsets = (_r3_sequence(n_stretches * self.n_samples) - 0.5).reshape(3, n_stretches, self.n_samples)
+        samplers = [_Sampler(layer, self.grid, self.levels, offsets) for layer in (self.layer, *self.beneath)]
 
         def fill(first: int) -> tuple[Indices, Floats32]:
+            """Fill a block's voxels inside the shape; return the numbers (n,) and changes (2, n) of those that are cut."""
             number = np.arange(first, min(first + self.blocks.step, box.size))
-            place = np.stack(np.unravel_index(number, box.shape))
-            index = place + self.start[:, None]
-            side = layers[0].sort(index, 0)
-            whole, cut = tuple(place[:, side > 0]), np.flatnonzero(side == 0)
-            box[whole] = self.layer.over(box[whole])
+            index_in_box = np.stack(np.unravel_index(number, box.shape))
+            index = index_in_box + self.start[:, None]
+            side = samplers[0].classify(index, 0)
+            inside, cut = tuple(index_in_box[:, side > 0]), np.flatnonzero(side == 0)
+            box[inside] = self.layer.paint_over(box[inside])
             changes = np.zeros((2, len(cut)), np.float32)
-            _add_changes(changes, np.arange(len(cut)), index[:, cut], 0, layers)
+            _add_changes(changes, np.arange(len(cut)), index[:, cut], 0, samplers)
             return number[cut], changes
 
-        missing, cuts = self.mean_change * self.in_voxels + float(box.sum(dtype=np.float64)), []
-        for of_block in pool.map(fill, self.blocks):
-            cuts.append(of_block)
+        missing, blocks = self.mean_change * self.volume + float(box.sum(dtype=np.float64)), []
+        for block in pool.map(fill, self.blocks):
+            blocks.append(block)
             yield
-        cut, (change, uncertain) = (np.concatenate(parts, axis=-1) for parts in zip(*cuts, strict=True))
-        place = np.unravel_index(cut, box.shape)
-        # Layers sampled at different points may replace a little more than there was: what is left is then certain.
-        left = box[place] + change
-        change = np.clip(left, *self.limits) - box[place]
-        uncertain[(left < self.limits[0]) | (left > self.limits[1])] = 0
-        if self.in_grid:
-            # What is missing goes to where the shares c are uncertain, as c (1 - c): so they stay between 0 and 1.
+        number, (change, uncertainty) = (np.concatenate(arrays, axis=-1) for arrays in zip(*blocks, strict=True))
+        cut_voxels = np.unravel_index(number, box.shape)
+        # Layers sampled at different points may replace a little more than there was: a value clipped to the limits is
+        # certain.
+        values = box[cut_voxels] + change
+        change = np.clip(values, *self.limits) - box[cut_voxels]
+        uncertainty[(values < self.limits[0]) | (values > self.limits[1])] = 0
+        if self.is_in_grid:
+            # The missing change is distributed in proportion to the uncertainty c (1 - c) of each covered fraction c,
+            # which keeps the fractions between 0 and 1.
             missing -= float(box.sum(dtype=np.float64) + change.sum(dtype=np.float64))
-            spread = max(float(uncertain.sum(dtype=np.float64)), 1e-300)
-            change += np.float32(np.clip(missing / spread, -1, 1)) * uncertain
-        box[place] += change
+            uncertainty_sum = max(float(uncertainty.sum(dtype=np.float64)), 1e-300)
+            change += np.float32(np.clip(missing / uncertainty_sum, -1, 1)) * uncertainty
+        box[cut_voxels] += change
 
 
-class _Sampled:
-    """A layer's shape, and voxels cut into cells, so many (3,) along each axis at each of the `levels`."""
+class _Sampler:
+    """Sampling of one layer's shape in cells of voxels, which are divided more finely from level to level."""
 
     def __init__(self, layer: Layer, grid: Grid, levels: Sequence[Indices], offsets: Points) -> None:
-        """The last level's cells are sampled at `offsets` (3, stretches, n), in cells, from their centres."""
+        """Prepare the cells' geometry in the shape's frame.
+
+        `levels` are the numbers of cells (3,) along a voxel's axes. Cells of the last level are sampled at `offsets`
+        (3, n_stretches, n_samples), in units of a cell, from their centres.
+        """
         shape_from_index = layer.from_world @ grid.affine
         linear, origin = shape_from_index[:3, :3], shape_from_index[:3, 3:]
         self.layer, self.levels, self.n_samples = layer, levels, offsets.shape[2]
         self._offsets = np.tensordot(linear / levels[-1], offsets, 1).astype(np.float32)
-        self._cells = [(linear / parts, origin + linear @ (0.5 / parts - 0.5)[:, None]) for parts in levels]
-        # The distance of a cell's farthest corner from its centre, over the four diagonals of a parallelepiped.
+        # Of each level, the cells' edge vectors and the centre of cell (0, 0, 0).
+        self._cells = [(linear / n, origin + linear @ (0.5 / n - 0.5)[:, None]) for n in levels]
+        # Largest distance from a cell's centre to its corners: the maximum over a parallelepiped's four half diagonals.
         corners = 0.5 * (1 + 1e-5) * np.array([[1, 1, 1, -1], [1, 1, -1, 1], [1, -1, 1, 1]])
         self._half_diagonals = [np.linalg.norm(edges @ corners, axis=0).max() for edges, _ in self._cells]
 
-    def sort(self, index: Indices, level: int) -> NDArray[np.int8]:
-        """1 for the cells (3, n) inside, -1 for those outside, 0 for those that the surface may cut, (n,)."""
+    def classify(self, index: Indices, level: int) -> NDArray[np.int8]:
+        """Return for cells `index` (3, n) of a level: 1 if inside, -1 if outside, 0 if the surface may cut it, (n,)."""
         distance, half = self.layer.shape.distance(self._centers(index, level)), self._half_diagonals[level]
         return np.subtract(distance < -half, distance > half, dtype=np.int8)
 
-    def inside(self, index: Indices) -> Bools:
-        """Which points of the last level's cells (3, n) are inside, (n, samples)."""
+    def sample(self, index: Indices) -> Bools:
+        """Return whether each sample point of the last level's cells `index` (3, n) is inside, (n, n_samples)."""
         # The factors are primes that seldom divide the number of stretches: neighbours along any axis take different ones.
         stretch = (np.array([1, 53, 211]) @ index) % self._offsets.shape[1]
         points = self._centers(index, -1)[:, :, None] + self._offsets[:, stretch]
         return (self.layer.shape.distance(points.reshape(3, -1)) < 0).reshape(points.shape[1:])
 
     def paint(self, values: Floats32, index: Indices, level: int) -> None:
-        """Paint the layer over the `values` (n, points) of cells; its surface may cut those of the last level only."""
-        side = self.sort(index, level)
-        whole, cut = side > 0, np.flatnonzero(side == 0)
-        values[whole] = self.layer.over(values[whole])
+        """Paint the layer over the `values` (n, points) of cells `index` (3, n), in place.
+
+        The surface may cut cells only in the last level, where the points are the samples.
+        """
+        side = self.classify(index, level)
+        inside, cut = side > 0, np.flatnonzero(side == 0)
+        values[inside] = self.layer.paint_over(values[inside])
         if len(cut):
-            values[cut] = np.where(self.inside(index[:, cut]), self.layer.over(values[cut]), values[cut])
+            values[cut] = np.where(self.sample(index[:, cut]), self.layer.paint_over(values[cut]), values[cut])
 
     def _centers(self, index: Indices, level: int) -> Floats32:
+        """Return the centres (3, n) of cells `index` (3, n) of a level, mm, in the shape's frame."""
         edges, first = self._cells[level]
         return (edges @ index + first).astype(np.float32)
 
 
-def _add_changes(changes: Floats32, voxel: Indices, index: Indices, level: int, layers: Sequence[_Sampled]) -> None:
-    """Add what painting the first layer over the others changes in cells (3, n) of a level that their surfaces may cut.
+def _add_changes(changes: Floats32, voxels: Indices, index: Indices, level: int, samplers: Sequence[_Sampler]) -> None:
+    """Add to `changes` (2, N) the change by painting the first sampler's layer over the others, in cells of a level.
 
-    `voxel` (n,) are the columns of `changes` to add to: the change of the voxel's mean, and how much of it is uncertain.
+    `index` (3, n) are the cells, which surfaces may cut, and `voxels` (n,) the columns of `changes` for their voxels. The
+    rows of `changes` are the change of a voxel's mean, and its uncertainty: the change times 1 - c, c being the covered
+    fraction.
     """
-    own, *lower = layers
-    finer = min(level + 1, len(own.levels) - 1)
-    factor = own.levels[finer] // own.levels[level]
-    places = np.indices(tuple(factor.tolist())).reshape(3, 1, -1)
-    step = max(1, _BLOCK // (own.n_samples if finer == level else places.shape[2]))
-    for first in range(0, len(voxel), step):
-        cells, of = index[:, first : first + step], voxel[first : first + step]
-        if finer == level:
-            inside = own.inside(cells)
+    sampler, *lower_samplers = samplers
+    next_level = min(level + 1, len(sampler.levels) - 1)
+    factor = sampler.levels[next_level] // sampler.levels[level]
+    children = np.indices(tuple(factor.tolist())).reshape(3, 1, -1)
+    step = max(1, _BLOCK // (sampler.n_samples if next_level == level else children.shape[2]))
+    for first in range(0, len(voxels), step):
+        cells, columns = index[:, first : first + step], voxels[first : first + step]
+        if next_level == level:
+            inside = sampler.sample(cells)
         else:
-            cells = (cells[:, :, None] * factor[:, None, None] + places).reshape(3, -1)
-            of = np.repeat(of, places.shape[2])
-            sides = np.stack([layer.sort(cells, finer) for layer in layers])
-            whole = sides.all(axis=0)
-            cut, whole = ~whole & (sides[0] >= 0), whole & (sides[0] > 0)
-            _add_changes(changes, of[cut], cells[:, cut], finer, layers)
-            cells, of, inside = cells[:, whole], of[whole], np.ones((np.count_nonzero(whole), 1), bool)
-        beneath = np.zeros(inside.shape, np.float32)
-        for layer in lower:
-            layer.paint(beneath, cells, finer)
-        change = np.where(inside, np.float32(own.layer.value) - beneath, 0).mean(axis=1)
-        change /= np.float32(own.levels[finer].prod())
-        np.add.at(changes[0], of, change)
-        # A share c is uncertain as c (1 - c).
-        np.add.at(changes[1], of, np.abs(change) * (1 - inside.mean(axis=1, dtype=np.float32)))
+            cells = (cells[:, :, None] * factor[:, None, None] + children).reshape(3, -1)
+            columns = np.repeat(columns, children.shape[2])
+            sides = np.stack([s.classify(cells, next_level) for s in samplers])
+            is_uncut = sides.all(axis=0)
+            to_divide, to_fill = ~is_uncut & (sides[0] >= 0), is_uncut & (sides[0] > 0)
+            _add_changes(changes, columns[to_divide], cells[:, to_divide], next_level, samplers)
+            cells, columns, inside = cells[:, to_fill], columns[to_fill], np.ones((np.count_nonzero(to_fill), 1), bool)
+        values_beneath = np.zeros(inside.shape, np.float32)
+        for lower_sampler in lower_samplers:
+            lower_sampler.paint(values_beneath, cells, next_level)
+        change = np.where(inside, np.float32(sampler.layer.value) - values_beneath, 0).mean(axis=1)
+        change /= np.float32(sampler.levels[next_level].prod())
+        np.add.at(changes[0], columns, change)
+        # The change is proportional to c: its uncertainty is that of a covered fraction, c (1 - c).
+        np.add.at(changes[1], columns, np.abs(change) * (1 - inside.mean(axis=1, dtype=np.float32)))
 
 
 def line_integrals(layers: Sequence[Layer], starts: Points, ends: Points) -> Points:
-    """Integrals (N,) of the painting, value x mm, along the lines from `starts` to `ends`, (N, 3) world mm: exact."""
+    """Return exact integrals (N,) of the painting, value x mm, along lines from `starts` to `ends`, (N, 3), world mm."""
     step = max(1, _RAYS * _PARTS // max(_PARTS, *(layer.shape.n_parts for layer in layers), 1))
     blocks = (slice(first, first + step) for first in range(0, len(starts), step))
-    parts = (_integrals_of_block(layers, starts[block].T, ends[block].T) for block in blocks)
-    return np.concatenate([np.empty(0), *parts])
+    integrals = (_integrate_block(layers, starts[block].T, ends[block].T) for block in blocks)
+    return np.concatenate([np.empty(0), *integrals])
 
 
-def _integrals_of_block(layers: Sequence[Layer], starts: Points, ends: Points) -> Points:
-    """Integrals (N,) along lines (3, N), whose pieces between the surfaces they cross are painted in the layers' order."""
+def _integrate_block(layers: Sequence[Layer], starts: Points, ends: Points) -> Points:
+    """Return integrals (N,) of the painting, value x mm, along lines from `starts` to `ends`, (3, N), world mm.
+
+    Each line is split at all surfaces that it crosses, and its pieces are painted in the layers' order.
+    """
     directions = ends - starts
-    pieces: list[tuple[Any, ...]] = []
+    sections: list[tuple[Any, ...]] = []
     for layer in layers:
         linear = layer.from_world[:3, :3]
-        enter, leave = layer.shape.intervals(_moved(layer.from_world, starts), linear @ directions)
+        enter, leave = layer.shape.intervals(_transform(layer.from_world, starts), linear @ directions)
         enter, leave = np.maximum(enter, 0.0).T, np.minimum(leave, 1.0).T
         ray, part = np.nonzero(enter < leave)
-        content = (np.full(len(ray), held) for held in (layer.value, layer.adds))
-        pieces.append((ray, enter[ray, part], leave[ray, part], *content))
-    if not pieces:
+        value_and_mode = (np.full(len(ray), constant) for constant in (layer.value, layer.adds))
+        sections.append((ray, enter[ray, part], leave[ray, part], *value_and_mode))
+    if not sections:
         return np.zeros(starts.shape[1])
-    columns = [np.concatenate(column) for column in zip(*pieces, strict=True)]
+    columns = [np.concatenate(column) for column in zip(*sections, strict=True)]
     order = np.argsort(columns[0], kind="stable")  # keeps the layers' order in each ray
-    rays, enters, leaves, value, add = (column[order] for column in columns)
+    rays, enters, leaves, value, adds = (column[order] for column in columns)
     counts = np.bincount(rays, minlength=starts.shape[1])
     firsts = np.cumsum(counts) - counts
     integrals = np.zeros(starts.shape[1])
-    # Lines of about as many parts together, up to a power of 2, padded with empty ones.
+    # Rays of about as many sections are integrated together, padded with empty sections up to a power of 2.
     padded = np.where(counts > 0, 1 << np.ceil(np.log2(np.maximum(counts, 1))).astype(np.int64), 0)
-    for most in np.unique(padded[padded > 0]):
-        some = np.flatnonzero(padded == most)
-        number = np.arange(most)
-        there = number < counts[some, None]
-        index = np.where(there, firsts[some, None] + number, 0)
-        low, high = np.where(there, enters[index], 0.0), np.where(there, leaves[index], 0.0)
+    for n_sections in np.unique(padded[padded > 0]):
+        ray_group = np.flatnonzero(padded == n_sections)
+        number = np.arange(n_sections)
+        exists = number < counts[ray_group, None]
+        index = np.where(exists, firsts[ray_group, None] + number, 0)
+        low, high = np.where(exists, enters[index], 0.0), np.where(exists, leaves[index], 0.0)
         edges = np.sort(np.concatenate([low, high], axis=1), axis=1)
         middles = (edges[:, :-1] + edges[:, 1:]) / 2
-        painted = np.zeros_like(middles)
-        for k in range(most):
+        values = np.zeros_like(middles)
+        for k in range(n_sections):
             inside = (low[:, k, None] < middles) & (middles < high[:, k, None])
-            paint = np.where(add[index[:, k], None], painted, 0.0) + value[index[:, k], None]
-            painted = np.where(inside, paint, painted)
-        integrals[some] = np.einsum("rs,rs->r", painted, np.diff(edges, axis=1))
+            painted = np.where(adds[index[:, k], None], values, 0.0) + value[index[:, k], None]
+            values = np.where(inside, painted, values)
+        integrals[ray_group] = np.einsum("rs,rs->r", values, np.diff(edges, axis=1))
     return integrals * np.sqrt(np.einsum("in,in->n", directions, directions))
 
 
 def _shape_points(shape: Shape, first: int) -> Points:
-    """Points (3, n) of a shape, in its frame: those of a block that fills its box, from number `first` on."""
+    """Return the points (3, n), mm, of one block of the R3 sequence that lie inside a shape, in its frame.
+
+    The block of `_BOX_BLOCK` points begins with number `first` and fills the shape's box.
+    """
     points = (_r3_sequence(_BOX_BLOCK, first) - 0.5) * (2 * np.array(shape.half_box)[:, None])
     return points[:, shape.distance(points) < 0]
 
 
 def _r3_sequence(n: int, first: int = 0) -> Points:
-    """`n` points of the unit cube from number `first` on, (3, n).
+    """Return `n` points (3, n) of M. Roberts' R3 sequence in the unit cube, from number `first` on.
 
-    M. Roberts' R3, a low-discrepancy (Kronecker) sequence of the generalised golden ratio: any stretch of it is the
-    first one, shifted, and two consecutive stretches fill the cube as evenly as one of twice the length.
+    R3 is the low-discrepancy (Kronecker) sequence of the generalised golden ratio: any stretch of it is the first one,
+    shifted, and two consecutive stretches fill the cube as evenly as one of twice the length.
     """
     ratio = 1.2207440846057596  # the real root of x^4 = x + 1
     steps = ratio ** -np.arange(1.0, 4.0)
@@ -436,6 +490,6 @@ def _r3_sequence(n: int, first: int = 0) -> Points:
     return points - np.floor(points)  # the remainder, several times faster than %
 
 
-def _moved(pose: Points, points: Points) -> Points:
-    """`points` (3, N) transformed by a pose (4, 4)."""
+def _transform(pose: Points, points: Points) -> Points:
+    """Return `points` (3, N) transformed by a pose (4, 4)."""
     return pose[:3, :3] @ points + pose[:3, 3:]

@@ -1,4 +1,4 @@
-"""Phantoms: what all kinds have in common, and those given as a list of shapes."""
+"""Base class of all phantoms, and phantoms that users define by a list of shapes."""
 
 import itertools
 import math
@@ -25,25 +25,30 @@ from .shapes import Shape
 
 QUANTITIES = ("activity", "mu")
 _ENDS = ((-1.0, 1.0),) * 3
-_HELD = 0.98  # with a smaller fraction of the phantom on the grid, a warning is given
+_FRACTION_IN_GRID = 0.98  # a warning is given if a smaller fraction of the phantom lies in the grid
 
 
 class PhantomMesh(NamedTuple):
-    """One shape of a phantom as a closed mesh."""
+    """Closed mesh of one shape of a phantom."""
 
     name: str
-    vertices: Floats  # (V, 3), mm, in the phantom's frame
-    faces: NDArray[np.int32]  # triangles (F, 3), counter-clockwise as seen from outside
-    activity: float | None  # kBq/mL
-    mu: float | None  # 1/mm
+    """Name of the shape, or its kind and number."""
+    vertices: Floats
+    """Vertices (V, 3), mm, in the phantom's frame."""
+    faces: NDArray[np.int32]
+    """Triangles (F, 3), counter-clockwise as seen from outside."""
+    activity: float | None
+    """Activity concentration, kBq/mL, or None."""
+    mu: float | None
+    """Linear attenuation coefficient, 1/mm, or None."""
 
 
 class Phantom:
     """Shapes painted one over the other, with exact line integrals, voxels on any grid, and meshes.
 
-    The frame's origin is the phantom's middle; `pose` is world-from-phantom (4, 4), mm, any invertible affine (default:
+    The frame's origin is the phantom's centre; `pose` is world-from-phantom (4, 4), mm, any invertible affine (default:
     identity), see `euler_pose`. The `quantity` is ``"activity"`` (kBq/mL) or ``"mu"`` (1/mm, at `mu_energy`).
-    A kind of phantom defines its `shapes`; everything else follows. Its fields say what each setting is, and its unit.
+    A kind of phantom is a derived dataclass that defines `shapes`; its fields are its settings, each with its unit and help.
     """
 
     mu_energy: float = 140.5
@@ -51,36 +56,36 @@ class Phantom:
 
     @property
     def shapes(self) -> Sequence[Shape]:
-        """The shapes, from bottom to top."""
+        """Shapes of the phantom, from bottom to top."""
         raise NotImplementedError
 
     title: str = "phantom"
-    """The phantom's name in messages."""
+    """Name of the phantom in messages."""
 
     def __post_init__(self) -> None:
         check_settings(self, self.title)
         with naming(self.title):
-            len(self.shapes)
+            len(self.shapes)  # made now, so that settings that cannot be built are refused here
 
     @property
     def total_activity(self) -> float:
         """Activity of the whole phantom, kBq, from the shapes' volumes.
 
-        Partial overlaps are counted at points, to about 1/1000 of the smaller shape's content.
+        Partial overlaps are measured at sample points, to about 1/1000 of the smaller shape's content.
         """
-        return self._total("activity") * 1e-3  # kBq/mL times mm^3
+        return self._volume_integral("activity") * 1e-3  # kBq/mL times mm^3
 
     @property
     def extent(self) -> float:
-        """Diameter, mm, of a ball around the origin that contains the phantom, however it is turned."""
+        """Diameter, mm, of a ball around the origin that contains the phantom in every orientation."""
         return 2 * max(math.hypot(*shape.position) + shape.ball_radius for shape in self.shapes)
 
     @cached_property
     def box(self) -> tuple[Floats, Floats]:
-        """Opposite corners, mm, of a box along the axes of the phantom's own frame that contains it."""
+        """Lowest and highest corner (3,), mm, of a box along the axes of the phantom's frame that contains it."""
         low, high = np.full(3, np.inf), np.full(3, -np.inf)
         for shape in self.shapes:
-            # A cut may leave little of a shape: its polyhedron, slightly smaller than the shape, shows how much.
+            # A cut may leave little of a shape. The vertices of its mesh, slightly inside its surface, tell how much.
             corners = shape.surface()[0] if shape.cut else np.array(list(itertools.product(*_ENDS))) * shape.half_box
             points = moved(shape.pose, corners)
             low, high = np.minimum(low, points.min(axis=0)), np.maximum(high, points.max(axis=0))
@@ -89,24 +94,26 @@ class Phantom:
     def voxelize(
         self, grid: Grid, pose: ArrayLike | None = None, progress: Progress | None = None, quantity: str = "activity"
     ) -> Volume:
-        """The phantom as a volume on any `grid`; a voxel holds the mean over its volume, parts outside are cut off.
+        """Return the phantom as a `Volume` on any `grid`, each voxel with the mean over its volume.
 
-        `progress` is called as ``progress(done, total)`` and may raise `Cancelled`.
+        Parts of the phantom outside the grid are cut off, with a warning. `progress` is called as
+        ``progress(done, total)`` and may raise `Cancelled`.
         """
         instance(grid, Grid, "voxelize")
-        image = paint_voxels(grid, self._layers(quantity, pose), self._changes(quantity), progress)
-        whole = self._total(quantity) * (1.0 if pose is None else abs(float(np.linalg.det(np.asarray(pose)[:3, :3]))))
-        held = float(image.sum(dtype=np.float64)) * grid.voxel_volume / whole if whole > 0 else 1.0
-        if held < _HELD:
-            warn(f"{1 - held:.0%} of the {self.title} lies outside the grid: take larger or more voxels", 2)
+        image = paint_voxels(grid, self._layers(quantity, pose), self._mean_changes(quantity), progress)
+        scale = 1.0 if pose is None else abs(float(np.linalg.det(np.asarray(pose)[:3, :3])))
+        total = self._volume_integral(quantity) * scale
+        fraction = float(image.sum(dtype=np.float64)) * grid.voxel_volume / total if total > 0 else 1.0
+        if fraction < _FRACTION_IN_GRID:
+            warn(f"{1 - fraction:.0%} of the {self.title} lies outside the grid: take larger or more voxels", 2)
         return Volume(freeze(image), grid, quantity)
 
     def line_integrals(
         self, sources: ArrayLike, targets: ArrayLike, pose: ArrayLike | None = None, quantity: str = "activity"
     ) -> Floats:
-        """Integrals (N,) along lines, value x mm, exact (closed form).
+        """Return exact integrals (N,) along lines, value x mm, in closed form.
 
-        `sources` and `targets` are the ends of the lines, (N, 3) each, or (3,) for one that all lines share; world mm.
+        `sources` and `targets` are the ends of the lines, (N, 3) each, or (3,) for a point that all lines share; world mm.
         """
         layers = self._layers(quantity, pose)
         starts, ends = (
@@ -119,9 +126,9 @@ class Phantom:
         return line_integrals(layers, starts, ends)
 
     def project(self, views: Views, pose: ArrayLike | None = None, quantity: str = "activity") -> Floats32:
-        """Exact line integrals to the pixels' centres of all views: images (M, n_v, n_u), value x mm.
+        """Return exact line integrals from the sources of all `views` to their pixels' centres, (M, n_v, n_u), value x mm.
 
-        `Projector` with `Transmission` converges to them as voxels get smaller.
+        Images of `Projector` with `Transmission` converge to them as voxels get smaller.
         """
         instance(views, Views, "project")
         require(4.0 * len(views) * math.prod(views.shape), "a set of projections")
@@ -131,11 +138,14 @@ class Phantom:
         return images
 
     def values(self, points: ArrayLike, pose: ArrayLike | None = None, quantity: str = "activity") -> Floats:
-        """Values (N,) at world `points` (N, 3), mm."""
+        """Return the phantom's values (N,) at world `points` (N, 3), mm."""
         return values_at(self._layers(quantity, pose), real_array(points, "points", (None, 3)).T)
 
     def meshes(self) -> list[PhantomMesh]:
-        """A closed mesh of every shape, in the phantom's frame, from bottom to top; round surfaces become polyhedra."""
+        """Return a closed mesh of every shape, in the phantom's frame, from bottom to top.
+
+        Curved surfaces become polyhedra.
+        """
         meshes = []
         for i, shape in enumerate(self.shapes, 1):
             vertices, faces = shape.surface()
@@ -144,20 +154,20 @@ class Phantom:
             meshes.append(PhantomMesh(name, vertices, freeze(faces), shape.activity, shape.mu))
         return meshes
 
-    def _total(self, quantity: str) -> float:
-        """The value times mm^3 of the whole phantom."""
+    def _volume_integral(self, quantity: str) -> float:
+        """Return the integral of the quantity over the whole phantom, value x mm^3, in the phantom's frame."""
         layers = self._layers(quantity)
-        return sum(x.volume * change for x, change in zip(layers, self._changes(quantity), strict=True))
+        return sum(layer.volume * change for layer, change in zip(layers, self._mean_changes(quantity), strict=True))
 
-    def _changes(self, quantity: str) -> list[float]:
-        """`mean_changes` of the shapes that hold the quantity; any pose leaves them as they are."""
-        known: dict[str, list[float]] = vars(self).setdefault("_known_changes", {})
-        if quantity not in known:
-            known[quantity] = mean_changes(self._layers(quantity))
-        return known[quantity]
+    def _mean_changes(self, quantity: str) -> list[float]:
+        """Return `mean_changes` of the layers of a quantity, computed once: they do not depend on the pose."""
+        cache: dict[str, list[float]] = vars(self).setdefault("_cached_changes", {})
+        if quantity not in cache:
+            cache[quantity] = mean_changes(self._layers(quantity))
+        return cache[quantity]
 
     def _layers(self, quantity: str, pose: ArrayLike | None = None) -> list[Layer]:
-        """The shapes that have the quantity, placed in the world."""
+        """Return layers of the shapes that have the quantity, from bottom to top, placed in the world by `pose`."""
         one_of(quantity, QUANTITIES, "quantity")
         world = np.eye(4) if pose is None else checked_affine(pose, "phantom pose")
         return [
@@ -169,9 +179,9 @@ class Phantom:
 
 @dataclass(frozen=True)
 class ShapePhantom(Phantom):
-    """A phantom given as a list of shapes, in the order of painting: later ones replace what is beneath them.
+    """A phantom of your own shapes in the order of painting: later shapes replace, or add to, those beneath them.
 
-    `mu_energy` is the energy, keV, at which mu holds. Negative shapes may not make a sum negative.
+    Shapes with negative values must not make the sum negative anywhere.
 
     Examples
     --------
@@ -181,8 +191,11 @@ class ShapePhantom(Phantom):
     """
 
     shapes: Sequence[Shape] = ()
+    """Shapes of the phantom, from bottom to top."""
     name: str = ""
+    """Name of the phantom in messages and files."""
     mu_energy: float = 140.5
+    """Energy, keV, at which mu holds."""
 
     def __post_init__(self) -> None:
         if isinstance(self.shapes, Shape) or not isinstance(self.shapes, Iterable):
@@ -210,5 +223,5 @@ class ShapePhantom(Phantom):
                     number = next(i for i, shape in enumerate(shapes, 1) if shape is layer.shape)
                     name = f"shape {number}" + (f" {layer.shape.name!r}" if layer.shape.name else "")
                     place = " ".join(f"{x:.4g}" for x in points[:, values.argmin()])
-                    added = f"{layer.value:g} {UNITS[quantity]} added leaves {lowest:g} at {place} mm"
-                    raise InputError(f"{name}: {quantity}: {added}; expected 0 or more")
+                    sum_text = f"{layer.value:g} {UNITS[quantity]} added leaves {lowest:g} at {place} mm"
+                    raise InputError(f"{name}: {quantity}: {sum_text}; expected 0 or more")

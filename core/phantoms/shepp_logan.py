@@ -1,4 +1,4 @@
-"""The three-dimensional Shepp-Logan head phantom: ten ellipsoids, added up."""
+"""The three-dimensional Shepp-Logan head phantom: ten ellipsoids whose values add up."""
 
 import math
 from collections.abc import Sequence
@@ -10,7 +10,8 @@ from .phantom import Phantom
 from .settings import choice, setting
 from .shapes import Ellipsoid, Shape
 
-# Half axes and centre in units of `half_size`, turn about z in degrees; density, and value of the modified phantom.
+# Rows: half axes and centre in units of `half_size`, rotation about z in degrees, density (original contrast), and value
+# with modified contrast.
 _ELLIPSOIDS = (
     ((0.6900, 0.920, 0.810), (0.0, 0.0, 0.0), 0.0, 2.00, 1.0),
     ((0.6624, 0.874, 0.780), (0.0, -0.0184, 0.0), 0.0, -0.98, -0.8),
@@ -40,25 +41,25 @@ class SheppLogan(Phantom):
     ``"original"`` (1 % between the parts of the brain); mu always has the original densities.
     """
 
-    half_size: float = setting(75.0, "mm", "the unit of the tables: the head is 1.84 times as long")
-    activity: float = setting(100.0, "kBq/mL", "where the table says 1", 0.0)
-    mu: float = setting(WATER_MU, "1/mm", "where the density is 1", 0.0)
-    contrast: str = choice("modified", CONTRASTS, "of the activity")
+    half_size: float = setting(75.0, "mm", "unit of length of the tables; the head is 1.84 times as long")
+    activity: float = setting(100.0, "kBq/mL", "activity where the table's value is 1", 0.0)
+    mu: float = setting(WATER_MU, "1/mm", "attenuation coefficient where the density is 1", 0.0)
+    contrast: str = choice("modified", CONTRASTS, "contrast of the activity")
 
     title = "Shepp-Logan phantom"
 
     @cached_property
     def shapes(self) -> Sequence[Shape]:
-        """The ellipsoids, in the table's order."""
+        """Ellipsoids in the order of the table."""
         return [
             Ellipsoid(
                 radii=[self.half_size * r for r in radii],
-                position=[self.half_size * c for c in centre],
-                euler=(math.radians(turn), 0.0, 0.0),
+                position=[self.half_size * c for c in center],
+                euler=(math.radians(degrees), 0.0, 0.0),
                 mode="add",
                 name=f"ellipsoid {i}",
                 activity=self.activity * (modified if self.contrast == "modified" else density),
                 mu=self.mu * density,
             )
-            for i, (radii, centre, turn, density, modified) in enumerate(_ELLIPSOIDS, 1)
+            for i, (radii, center, degrees, density, modified) in enumerate(_ELLIPSOIDS, 1)
         ]

@@ -1,8 +1,8 @@
-"""How images move with the geometry: derivatives by the modules' places, frames, collimators, holes and pixels."""
+"""Gradients of counts by the geometry: the modules' positions, frames, collimators, holes and pixels."""
 
 from dataclasses import replace
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -10,70 +10,76 @@ from ..arrays import Array, Floats, Floats32, checked
 from ..errors import InputError
 from ..geometry.frames import module_frames, tilt_frames
 from ..geometry.system import PinholeSystem
+from ..models.model import with_image_axes
+from ..pinhole_response.pinhole_operator import PinholeOperator
 from ..volumes.volume import Volume
-from .emission import Emission
-from .models import each_pixel
 from .operator import Projector
 
-# Steps of central differences of what is smooth and quickly made: relative, or rad.
+# Step of central differences of smooth and quickly computed quantities: relative, or rad.
 _STEP = 1e-5
 
 
 class GeometryGradient(NamedTuple):
-    """Derivatives of a sum over the images of M modules; each is at constant other numbers."""
+    """Gradient of a sum over the images of M modules; each field is at constant values of the other numbers."""
 
     centers: Floats
-    """(M, 3): by the pinholes' places, 1/mm, the modules' frames being held."""
+    """(M, 3), by the pinholes' centres at constant frames of the modules, 1/mm."""
     frames: Floats
-    """(M, 3, 3): by the entries of ``system.frames()``, rows u, v, k."""
+    """(M, 3, 3), by the entries of ``system.frames()``, rows u, v, k."""
     collimator_length: Floats
-    """(M,), 1/mm, with the pixels of the crystal as they are, as the others."""
+    """(M,), by the collimators' lengths at constant pixels on the crystal, 1/mm."""
     pinhole_diameter: Floats
-    """(M,), 1/mm."""
+    """(M,), by the holes' diameters, 1/mm."""
     pitch: Floats
-    """(M, 2): by the pixels' sizes along u and v on the crystal, 1/mm, around the image's middle."""
+    """(M, 2), by the pixels' sizes along u and v on the crystal, 1/mm, around the image's middle."""
     offset: Floats
-    """(M, 2): by the image's middle along u and v on the crystal, 1/mm; that of a virtual detector is point-inverted."""
+    """(M, 2), by the position of the image's middle along u and v on the crystal, 1/mm, point-inverted if it is virtual."""
 
     def by_columns(self, system: PinholeSystem) -> tuple[Floats, Floats]:
-        """Derivatives by ``system.centers``, with which frames turn, and by ``system.tilt``: (M, 3), 1/mm and 1/rad."""
-        by_centers, by_tilt = self.centers.copy(), np.empty_like(self.centers)
+        """Return the gradients by ``system.centers`` and by ``system.tilt``, (M, 3) each, 1/mm and 1/rad.
+
+        The modules stay aimed: their frames turn with the centres. How frames turn is a central difference.
+        """
+        d_centers, d_tilt = self.centers.copy(), np.empty_like(self.centers)
         for axis, step in enumerate(_STEP * np.eye(3)):
-            far = step * system.pinhole_distance[:, None]
-            aimed = tilt_frames(module_frames(system.centers + far), system.tilt)
-            aimed = aimed - tilt_frames(module_frames(system.centers - far), system.tilt)
+            shift = step * system.pinhole_distance[:, None]
+            d_frames = tilt_frames(module_frames(system.centers + shift), system.tilt)
+            d_frames = d_frames - tilt_frames(module_frames(system.centers - shift), system.tilt)
+            d_centers[:, axis] += np.einsum("mij,mij->m", self.frames, d_frames) / (2 * shift[:, axis])
             nominal = module_frames(system.centers)
-            turned = tilt_frames(nominal, system.tilt + step) - tilt_frames(nominal, system.tilt - step)
-            by_centers[:, axis] += np.einsum("mij,mij->m", self.frames, aimed) / (2 * far[:, axis])
-            by_tilt[:, axis] = np.einsum("mij,mij->m", self.frames, turned) / (2 * _STEP)
-        return by_centers, by_tilt
+            d_frames = tilt_frames(nominal, system.tilt + step) - tilt_frames(nominal, system.tilt - step)
+            d_tilt[:, axis] = np.einsum("mij,mij->m", self.frames, d_frames) / (2 * _STEP)
+        return d_centers, d_tilt
 
 
 def geometry_gradient(A: Projector, volume: Volume | Floats | Floats32, images: Floats | Floats32) -> GeometryGradient:
-    """Of the sum of `images` times ``A(volume)``, the derivatives by the geometry.
+    """Return the gradient of the sum of `images` times ``A(volume)`` by the geometry.
 
-    They are exact derivatives of what `A` computes, but for the few places where the number of a voxel's parts, of cells or
-    of planes changes. Attenuated, there are more such places: at each, rays pass from voxel to voxel. With float64 they hold
-    to 1e-8 (``Projector(..., double=True)``), else as far as float32 does.
+    It is the gradient of the images that `A` computes, but for the few geometries at which the number of a voxel's points,
+    of cells or of planes changes. With attenuation there are more of these: at each, rays pass from voxel to voxel. In
+    float64 it holds to 1e-8 (``Projector(..., double=True)``), else as far as float32 does. The chain rule is analytic, but
+    for a few smooth factors, which are central differences (docs/counts.md lists them).
 
     Parameters
     ----------
     A
-        Of `Emission` by its depth-dependent response (hole "auto" or "depth"), in numpy.
+        Projector of `Emission` by its depth-dependent response (hole "auto" or "depth"), in numpy.
     volume, images
-        (n_x, n_y, n_z), or a `Volume`; and (M, n_v, n_u). Of a batch of both, with one axis more before, the sum, which
-        takes less time than one by one.
+        Volume (n_x, n_y, n_z) or a `Volume`, and images (M, n_v, n_u). For a batch of both, with one axis more before, the
+        result is the sum, which takes less time than one by one.
 
     Raises
     ------
     InputError
-        Another model or shape; voxels so close to a pinhole that rays project them.
+        The projector has another model, the images another shape, or voxels are so close to a pinhole that rays project
+        them.
     """
     if A._parts:
-        of_parts = [geometry_gradient(part, volume, images) for part in A._parts]
-        return GeometryGradient(*(np.sum(own, axis=0) for own in zip(*of_parts, strict=True)))
-    holes, model = A._depths, A.model
-    if holes is None or not isinstance(model, Emission):
+        gradients = [geometry_gradient(part, volume, images) for part in A._parts]
+        return GeometryGradient(*(np.sum(arrays, axis=0) for arrays in zip(*gradients, strict=True)))
+    pinholes = A._pinholes
+    model: Any = A.model
+    if pinholes is None or not model.has_geometry_gradient:
         expected = "a projector of Emission by hole 'depth'; those by rays are in `emission_images`"
         raise InputError(f"geometry gradient: expected {expected}")
     if A._close_parts:
@@ -82,41 +88,42 @@ def geometry_gradient(A: Projector, volume: Volume | Floats | Floats32, images: 
         raise InputError(f"geometry gradient: {close}; take a smaller grid")
     array = A._check(volume)
     array = array.reshape(-1, *A.shape_in)
-    given = checked(images, "images", A.shape_out, A._float64, batch=True).reshape(-1, *A.shape_out)
-    if len(given) != len(array):
-        raise InputError(f"geometry gradient: {len(array)} volumes, but images of {len(given)}")
-    volumes, functions, threads = A._depth_arguments(array)
-    responded = np.stack([np.asarray(A._responded(each.astype(volumes.dtype, copy=False))) for each in given])
-    centers, frames, by = holes.gradient(volumes, responded, functions, threads)
+    batch = checked(images, "images", A.shape_out, A._float64, batch=True).reshape(-1, *A.shape_out)
+    if len(batch) != len(array):
+        raise InputError(f"geometry gradient: {len(array)} volumes, but images of {len(batch)}")
+    volumes, backend, threads = A._pinhole_arguments(array)
+    before_response = [np.asarray(A._response_adjoint(data.astype(volumes.dtype, copy=False))) for data in batch]
+    centers, frames, numbers = pinholes.gradient(volumes, np.stack(before_response), backend, threads)
     u, v, _ = model.system.frames().transpose(1, 0, 2)
     # Along a real detector, steps go backwards.
     signs = np.sign([np.einsum("mi,mi->m", s, a) for s, a in ((A.views.v_steps, v), (A.views.u_steps, u))]).T
-    diameter = by["diameter"] * _effective_rise(model)
-    pitch, offset = ((by[name] * signs)[:, ::-1] for name in ("pitch", "first"))
-    pitch = pitch + sum(map(partial(_by_blur, A), volumes, given))
-    return GeometryGradient(centers, frames, by["length"], diameter, pitch, offset)
+    diameter = numbers["diameter"] * _d_effective_diameter(model)
+    pitch, offset = ((numbers[name] * signs)[:, ::-1] for name in ("pitch", "first"))
+    pitch = pitch + sum(map(partial(_pitch_gradient_of_blur, A, pinholes), volumes, batch))
+    return GeometryGradient(centers, frames, numbers["length"], diameter, pitch, offset)
 
 
-def _effective_rise(model: Emission) -> Floats:
-    """The derivative of the effective diameter by Paix, which the response is made of, by the diameter (M,)."""
+def _d_effective_diameter(model: Any) -> Floats:
+    """Return d(d_e)/dd (M,), the derivative of Paix's effective diameter, of the response, by central differences."""
     d = model.system.pinhole_diameter
     optics = replace(model.optics, edge="paix", plate_thickness=None)
-    more, less = (optics.effective_diameter(d * scale) for scale in (1 + _STEP, 1 - _STEP))
-    return np.asarray((more - less) / (2 * _STEP * d))
+    upper, lower = (optics.effective_diameter(d * scale) for scale in (1 + _STEP, 1 - _STEP))
+    return np.asarray((upper - lower) / (2 * _STEP * d))
 
 
-def _by_blur(A: Projector, volume: Array, images: Array) -> Array:
-    """Derivatives through the detector's blur by the pixels' sizes along u and v, (M, 2)."""
-    by, holes, views, model = np.zeros((len(images), 2)), A._depths, A.views, A.model
-    images = images * each_pixel(model.efficiency)
-    if holes is None or not isinstance(model, Emission) or model.response(views, 0) is None:
-        return by
+def _pitch_gradient_of_blur(A: Projector, pinholes: PinholeOperator, volume: Array, images: Array) -> Array:
+    """Return the gradient (M, 2) by the pixels' sizes along u and v through the detector's blur, by central differences."""
+    gradient, views = np.zeros((len(images), 2)), A.views
+    model: Any = A.model
+    images = images * with_image_axes(model.efficiency)
+    if model.response(views, 0) is None:
+        return gradient
     scales = 1 + _STEP, 1 - _STEP
     wide, narrow = (replace(views, u_steps=a * views.u_steps, v_steps=a * views.v_steps) for a in scales)
-    for m, image in enumerate(holes.images(volume, *A._depth_arguments(volume)[1:])):
-        (v, u), more, less = (model.response(each, m) for each in (views, wide, narrow))  # type: ignore[misc]
-        rise_v, rise_u = ((a - b) / (2 * _STEP) for a, b in zip(more, less, strict=True))  # type: ignore[arg-type]
+    for m, image in enumerate(pinholes.images(volume, *A._pinhole_arguments(volume)[1:], None)):
+        (v, u), upper, lower = (model.response(scaled, m) for scaled in (views, wide, narrow))
+        d_v, d_u = ((a - b) / (2 * _STEP) for a, b in zip(upper, lower, strict=True))
         pitch = model.crystal_pitch(views, m)
-        by[m, 0] = (images[m] * (v @ image @ rise_u.T)).sum() / pitch[0]
-        by[m, 1] = (images[m] * (rise_v @ image @ u.T)).sum() / pitch[1]
-    return by
+        gradient[m, 0] = (images[m] * (v @ image @ d_u.T)).sum() / pitch[0]
+        gradient[m, 1] = (images[m] * (d_v @ image @ u.T)).sum() / pitch[1]
+    return gradient

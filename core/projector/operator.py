@@ -1,4 +1,4 @@
-"""The projector as a linear operator."""
+"""The projector: the linear operator from a volume to the images of views, by rays or by the pinhole response."""
 
 from __future__ import annotations
 
@@ -15,47 +15,48 @@ from ..errors import InputError, warn
 from ..geometry.grid import Grid
 from ..geometry.views import Views
 from ..memory import Requirements
+from ..models.model import Model, Transmission, with_image_axes
+from ..pinhole_response.pinhole_operator import depth_backend
+from ..pinhole_response.transmittance import ArrayOnGrid
 from ..progress import Progress, part_of, tell
+from ..rays import backends
+from ..rays.bundles import Bundles, RayBundle
+from ..rays.execution import Execution
+from ..rays.lattices import require_no_negative, same_lattice
+from ..rays.linear_operator import LinearOperator
+from ..rays.parallel import thread_count
 from ..recording import recorded_warnings
 from ..validation import freeze, shape_text
 from ..volumes.images import Images
 from ..volumes.volume import AIR_HU, CONVERT, Volume
-from . import backends
-from .bundles import Bundle, Bundles
-from .doubts import doubts
-from .execution import Execution
-from .lattices import require_no_negative, same_lattice
-from .linear_operator import LinearOperator
-from .models import Model, Transmission, each_pixel
-from .parallel import thread_count
 from .subsets import balanced_subsets
-from .transmittance import Field
 
-_PADDING = (-2000.0, -2048.0, -3024.0)  # what CT scanners write outside of what they scanned
+_PADDING = (-2000.0, -2048.0, -3024.0)  # values that CT scanners write outside the scanned region
+_NARROW = 1.0  # mm: bodies are wider, and a grid of so many metres hardly fits into a scanner
 
 
 class Projector(LinearOperator):
-    """Images of a volume, and the adjoint.
+    """Linear map from a volume to the images of M views, and its exact adjoint.
 
     Parameters
     ----------
     grid : Grid
-        The voxels. Values outside are 0.
+        Grid of the voxels. Values outside are 0.
     views : Views
-        The M images: rays from each source to the centres of the pixels.
+        The M views: rays from each source to the centres of the pixels.
     model : Transmission or Emission
-        What a pixel measures; by default the line integral.
+        Model of what a pixel measures; by default the line integral.
     backend : str
         ``"numpy"`` (the float64 reference), ``"torch"`` (on the device of a tensor), ``"cpu"`` (compiled, on the
         processor), ``"cuda"`` (NVIDIA GPUs; ``pip install warp-lang``), or ``"auto"``: cpu where there are kernels for the
-        platform, else torch, else numpy; for a tensor on a GPU cuda if it works there, else torch. Arrays go to a GPU only
-        when asked.
+        platform, else torch, else numpy; for a tensor on a GPU cuda if it works there, else torch. Arrays go to a GPU with
+        ``"cuda"`` alone.
     threads : int, optional
-        Threads of cpu and numpy, by default one per core (torch has a setting of its own, cuda needs none). The images do
-        not depend on it; the adjoint does by float32 rounding, and is the same every time for a given number.
+        Number of threads of cpu and numpy, by default one per core (torch has a setting of its own, cuda needs none). The
+        images do not depend on it; the adjoint does by float32 rounding, and is the same every time for a given number.
         The adjoint takes a volume per thread, so it uses at most 8, and fewer when memory is short.
     double : bool
-        Whether to compute in float64, whatever it is given; not with cuda.
+        Whether to compute in float64, also from float32; not with cuda.
 
     Raises
     ------
@@ -68,7 +69,7 @@ class Projector(LinearOperator):
     The results are float32; float64 with `double` or ``backend="numpy"``, and for tensors of float64 with all backends but
     cuda.
     On a GPU the adjoint of the torch and cuda backends adds in no fixed order: it differs by float32 rounding from
-    call to call. Up to 128 MiB of rays and their weights are kept from call to call, of lines apart for each line.
+    call to call. Up to 128 MiB of rays and their weights are stored from call to call, with lines apart for each line.
 
     Examples
     --------
@@ -94,13 +95,13 @@ class Projector(LinearOperator):
         double: bool = False,
     ) -> None:
         model = Transmission() if model is None else model
-        for value, kind, what in (
+        for value, kind, expected in (
             (grid, Grid, "grid to be Grid"),
             (views, Views, "views to be Views"),
             (model, Model, "model to be Transmission, Emission or another model"),
         ):
             if not isinstance(value, kind):
-                raise InputError(f"projector: expected {what}, got {type(value).__name__}")
+                raise InputError(f"projector: expected {expected}, got {type(value).__name__}")
         self.grid, self.views = grid, views
         self._require = Requirements()
         self._auto = backend == "auto"
@@ -114,32 +115,32 @@ class Projector(LinearOperator):
             model = model.by_rays()
         self.model = model
         model.check(views)
-        for doubt in doubts(grid, views, model):
-            warn(doubt, 2)
+        for text in _warnings(grid, views, model):
+            warn(text, 2)
         self.threads = thread_count(threads)
         self.which = freeze(np.arange(len(views)))
         self._bundles = Bundles(len(views), self._bundle)
         parts = model.parts()
-        with recorded_warnings():  # this projector has given them
+        with recorded_warnings():  # they are those of this projector
             self._parts = [Projector(grid, views, part, **self._settings) for part in parts if part is not model]
-        self._depths = None if self._parts else model.by_depth(views, grid)
+        self._pinholes = None if self._parts else model.by_depth(views, grid)
 
     def __call__(
         self, x: Volume | ArrayOrTensor, progress: Progress | None = None, mu: ArrayOrTensor = None
     ) -> ArrayOrTensor:
-        """The images of a volume.
+        """Return the images of a volume.
 
         Parameters
         ----------
         x, progress
-            The same as for any `LinearOperator`; `x` may also be a `Volume`.
+            Volume, (..., n_x, n_y, n_z) or a `Volume`, and progress, as of any `LinearOperator`.
         mu
-            Attenuation coefficients, 1/mm, in place of the model's: an array or tensor on the grid of its `mu`, one for a
-            whole batch.
+            Attenuation coefficients, 1/mm, in place of the model's: an array or tensor on the grid of the model's `mu`, one
+            for a whole batch.
 
         Returns
         -------
-        array or tensor
+        array or tensor (..., M, n_v, n_u)
             A tensor if `x` or `mu` is one, else a numpy array: part of torch's graph if `x` or `mu` requires a
             gradient, for every backend. Where `mu` requires one, gradients of gradients are refused.
 
@@ -151,7 +152,7 @@ class Projector(LinearOperator):
         if mu is None:
             images = super().__call__(x, progress)
             is_labelled = isinstance(x, Volume) and self.model.takes != ("activity",)
-            return Images.of(images, x.quantity) if is_labelled else images
+            return Images.tag(images, x.quantity) if is_labelled else images
         x = self._check(x)
         if self.model.mu is None:
             raise InputError("mu: the projector's model has none; give it one to say on which grid mu is")
@@ -161,12 +162,13 @@ class Projector(LinearOperator):
         x, mu = promote(x, require_no_negative(checked(mu, "mu", self.model.mu.grid.shape, self._float64)))
         if not getattr(mu, "requires_grad", False):
             return self._apply(x, progress, mu)
-        from . import autograd
+        from ..rays import autograd
 
         def run(needs: Any) -> Any:
             def gradients(images: ArrayOrTensor, needs: Any) -> Any:
-                by_x, by_mu = needs
-                return self.T._run(images, mu=mu) if by_x else None, self._mu_gradient(images, x, mu) if by_mu else None
+                needs_x, needs_mu = needs
+                d_x = self.T._run(images, mu=mu) if needs_x else None
+                return d_x, self._mu_gradient(images, x, mu) if needs_mu else None
 
             return self._run(x.detach(), progress, mu.detach()), gradients
 
@@ -174,7 +176,7 @@ class Projector(LinearOperator):
 
     @property
     def backend(self) -> str:
-        """The backend's name; "auto" stands for one of them."""
+        """Name of the backend, also where "auto" has chosen it."""
         return self._backend.name
 
     @property
@@ -189,38 +191,39 @@ class Projector(LinearOperator):
 
     @property
     def background(self) -> Array:
-        """What the model expects besides the volume's images, (M, n_v, n_u), read-only: ``A(x) + A.background``.
+        """Expected counts of the model besides the volume's, (M, n_v, n_u), read-only: all are ``A(x) + A.background``.
 
         Dead pixels have none.
         """
-        values = each_pixel(self.model.background)
+        values = with_image_axes(self.model.background)
         return freeze(np.where(self.living, values, 0.0)) if values.any() else np.broadcast_to(values, self.shape_out)
 
     @property
     def living(self) -> NDArray[np.bool_]:
-        """Which pixels are not dead, (M, n_v, n_u), read-only: those whose efficiency in the model is not 0."""
-        return np.broadcast_to(each_pixel(self.model.efficiency) > 0, self.shape_out)
+        """Mask (M, n_v, n_u), read-only, of the pixels that are not dead: their efficiency in the model is not 0."""
+        return np.broadcast_to(with_image_axes(self.model.efficiency) > 0, self.shape_out)
 
     def iter_views(self, volume: Volume | ArrayOrTensor) -> Iterator[ArrayOrTensor]:
-        """The images one by one, each (n_v, n_u): work between which a job can stop. Gradients are not recorded.
+        """Yield the images (n_v, n_u) one by one, so that a job can stop between them; gradients are not recorded.
 
-        Leave the volume as it is until the last: images are made ahead of need.
+        The volume must not change before the last image: images are computed ahead of need.
         """
         volume = self._check(volume, batch=False)
         return (to_caller(image, volume) for image in self._images(volume))
 
     def subsets(self, n: int) -> list[Projector]:
-        """`n` projectors of parts of the views, balanced over rings and angles, their sizes differing by one at most.
+        """Return `n` projectors of disjoint subsets of the views, balanced over rings and angles.
 
-        Each one's `which` says which views it has. Raises InputError where `n` is not from 1 to their number.
+        The sizes of subsets differ by one at most; the attribute `which` of each has the indices of its views. Raise
+        `InputError` if `n` is not from 1 to the number of views.
         """
-        parts: list[Projector] = []
-        with recorded_warnings():  # this projector has given them
-            for which in balanced_subsets(self.views, n):
-                own = self.grid, self.views[which], self.model.of_views(which)
-                parts.append(copy.copy(self) if n == 1 else Projector(*own, **self._settings))
-                parts[-1].which = freeze(which)
-        return parts
+        projectors: list[Projector] = []
+        with recorded_warnings():  # they are those of this projector
+            for indices in balanced_subsets(self.views, n):
+                subset = self.grid, self.views[indices], self.model.of_views(indices)
+                projectors.append(copy.copy(self) if n == 1 else Projector(*subset, **self._settings))
+                projectors[-1].which = freeze(indices)
+        return projectors
 
     def __repr__(self) -> str:
         voxels, pixels = shape_text(self.grid.shape), shape_text(self.views.shape)
@@ -229,23 +232,23 @@ class Projector(LinearOperator):
     def _check(self, x: Volume | ArrayOrTensor, batch: bool = True) -> ArrayOrTensor:
         if isinstance(x, Volume):
             if not same_lattice(x.grid, self.grid):
-                its, wanted = map(_describe, (x.grid, self.grid))
-                raise InputError(f"volume: its grid ({its}) is not the projector's ({wanted})")
+                actual, expected = map(_describe, (x.grid, self.grid))
+                raise InputError(f"volume: its grid ({actual}) is not the projector's ({expected})")
             self.model.check_volume(x)
         array = x.array if isinstance(x, Volume) else checked(x, "volume", self.shape_in, self._float64, batch)
-        # A thousand voxels or so: to look at all would take as long as an image.
-        few: Any = (..., *(slice(n // 20, None, 1 + n // 10) for n in self.shape_in))
-        some = to_numpy(array[few], np.float32)
-        air = np.isin(some, _PADDING) | (abs(some - AIR_HU) < 50)
-        if np.count_nonzero(air) > 0.05 * air.size:
-            warn(f"volume: {np.mean(air):.0%} of its values are those of air in CT numbers{CONVERT}", 4)
+        # A thousand voxels or so are a sample: to look at all would take as long as an image.
+        sample: Any = (..., *(slice(n // 20, None, 1 + n // 10) for n in self.shape_in))
+        values = to_numpy(array[sample], np.float32)
+        is_air = np.isin(values, _PADDING) | (abs(values - AIR_HU) < 50)
+        if np.count_nonzero(is_air) > 0.05 * is_air.size:
+            warn(f"volume: {np.mean(is_air):.0%} of its values are those of air in CT numbers{CONVERT}", 4)
         return array
 
     def _run_one(self, x: ArrayOrTensor, progress: Progress | None = None, mu: ArrayOrTensor = None) -> ArrayOrTensor:
         n_views, n_v, n_u = self.shape_out
         itemsize = 8 if self._float64 or is_double(x) else 4
-        what = f"projecting {shape_text(self.shape_in)} voxels into {n_views} images of {n_v} x {n_u} pixels"
-        self._require(itemsize * (n_views * n_v * n_u + self.grid.n_voxels) + self._extra_bytes(itemsize), what)
+        work = f"projecting {shape_text(self.shape_in)} voxels into {n_views} images of {n_v} x {n_u} pixels"
+        self._require(itemsize * (n_views * n_v * n_u + self.grid.n_voxels) + self._extra_bytes(itemsize), work)
         images = None
         tell(progress, 0, n_views)
         for m, image in enumerate(self._images(x, mu)):
@@ -261,77 +264,83 @@ class Projector(LinearOperator):
             n = len(self._parts)
             return sum(A._run_back(y, part_of(progress, k, n), mu) for k, A in enumerate(self._parts))
         execution = self._execution(y)
-        given = images = execution.to_backend(y)
-        needed = images.itemsize * self.grid.n_voxels + self._extra_bytes(images.itemsize)
-        self._require(needed, f"the adjoint into {shape_text(self.grid.shape)} voxels")
+        detected = execution.to_backend(y)
+        n_bytes = detected.itemsize * self.grid.n_voxels + self._extra_bytes(detected.itemsize)
+        self._require(n_bytes, f"the adjoint into {shape_text(self.grid.shape)} voxels")
         self._require_rays()
         n = len(self.views)
         tell(progress, 0, n)
-        images = self._responded(images)
-        if self._depths is not None:
-            arguments = *self._depth_arguments(images), lambda done: tell(progress, done, n), self._mu_field(mu)
-            volume = self._depths.backproject(*arguments)
-            for m, box, close, of_part in self._close_parts:
-                volume[box] += np.where(close, of_part.T._run(to_numpy(given[m : m + 1], None), mu=mu), 0)
+        images = self._response_adjoint(detected)
+        if self._pinholes is not None:
+            arguments = *self._pinhole_arguments(images), lambda k: tell(progress, k, n), self._mu_on_grid(mu)
+            volume = self._pinholes.backproject(*arguments)
+            for m, box, is_close, A in self._close_parts:
+                volume[box] += np.where(is_close, A.T._run(to_numpy(detected[m : m + 1], None), mu=mu), 0)
         elif not self.model.weights_voxels:
-            volume = execution.backproject(images, self._bundles, self._mu(mu), lambda done: tell(progress, done, n))
+            volume = execution.backproject(images, self._bundles, self._mu(mu), lambda k: tell(progress, k, n))
         else:  # each view's volume is weighted before it is added to the total
             volume = zeros(self.grid.shape, images)
             for m in range(n):
-                of_view = execution.backproject(images[m : m + 1], self._bundles_of(m))
-                volume += of_view * self._voxel_weights(m, of_view)
+                view_volume = execution.backproject(images[m : m + 1], self._view_bundles(m))
+                volume += view_volume * self._voxel_weights(m, view_volume)
                 tell(progress, m + 1, n)
-        return to_caller(self._finished(volume, y), y)
+        return to_caller(self._as_result(volume, y), y)
 
     def _images(self, x: ArrayOrTensor, mu: ArrayOrTensor = None) -> Iterator[ArrayOrTensor]:
-        """Images of a checked volume, as the backend computes them."""
+        """Yield the images of a checked volume, arrays or tensors as the backend computes them."""
         if self._parts:
             yield from map(sum, zip(*(A._images(x, mu) for A in self._parts), strict=True))
             return
         self._require_rays()
         execution = self._execution(x)
-        for m, image in enumerate(self._projected(execution, x, mu)):
+        for m, image in enumerate(self._plain_images(execution, x, mu)):
             response = self.model.response(self.views, m)
             if response is not None:
                 along_v, along_u = (cast_like(matrix, image) for matrix in response)
                 image = along_v @ image @ along_u.T
-            if self._efficiency is not None:  # close parts have theirs
+            if self._efficiency is not None:  # the projectors of close voxels have their own
                 image = image * cast_like(self._efficiency[m], image)
-            for view, box, close, A in self._close_parts:
-                if view == m and (part := np.where(close, to_numpy(x[box], None), 0)).any():
-                    image = image + cast_like(A(part, mu=mu)[0], image)
-            yield self._finished(image, x)
+            for view, box, is_close, A in self._close_parts:
+                if view == m and (voxels := np.where(is_close, to_numpy(x[box], None), 0)).any():
+                    image = image + cast_like(A(voxels, mu=mu)[0], image)
+            yield self._as_result(image, x)
 
-    def _projected(self, execution: Execution, x: ArrayOrTensor, mu: ArrayOrTensor) -> Iterator[ArrayOrTensor]:
-        """The images before the detector's response."""
-        if self._depths is not None:
-            yield from self._depths.images(*self._depth_arguments(x), self._mu_field(mu))
+    def _plain_images(self, execution: Execution, x: ArrayOrTensor, mu: ArrayOrTensor) -> Iterator[ArrayOrTensor]:
+        """Yield the images before the detector's response and efficiency."""
+        if self._pinholes is not None:
+            yield from self._pinholes.images(*self._pinhole_arguments(x), self._mu_on_grid(mu))
             return
         if not self.model.weights_voxels:
             yield from execution.images(x, self._bundles, self._mu(mu))
             return
         x = execution.to_backend(x)
         for m in range(len(self.views)):
-            yield from execution.images(x * self._voxel_weights(m, x), self._bundles_of(m))
+            yield from execution.images(x * self._voxel_weights(m, x), self._view_bundles(m))
 
     def _mu_gradient(self, images: ArrayOrTensor, x: ArrayOrTensor, mu: ArrayOrTensor) -> ArrayOrTensor:
-        """The gradient of <A x, images> by mu, on mu's whole grid; of a batch the sum."""
+        """Return the gradient of <A x, images> by mu, on mu's whole grid; for a batch the sum."""
         if self._parts:
             return sum(A._mu_gradient(images, x, mu) for A in self._parts)
         execution = self._execution(x)
         total = zeros(mu.shape, images)
         for index in np.ndindex(x.shape[:-3]):
-            responded = self._responded(execution.to_backend(images[index]))
-            own = x[index].detach(), mu.detach()
-            if self._depths is None:
-                gradient = execution.mu_gradient(responded, self._bundles, *own)
+            before_response = self._response_adjoint(execution.to_backend(images[index]))
+            volumes = x[index].detach(), mu.detach()
+            if self._pinholes is None:
+                gradient = execution.mu_gradient(before_response, self._bundles, *volumes)
             else:
-                gradient = self._depth_mu_gradient(images[index], responded, *own)
-            total += to_caller(self._finished(gradient, images), images)
+                volume, *settings = self._pinhole_arguments(volumes[0])
+                arguments = volume, to_numpy(before_response, None), *settings, self._mu_on_grid(volumes[1])
+                gradient = self._pinholes.mu_gradient(*arguments)
+                for m, box, is_close, A in self._close_parts:
+                    voxels = cast_like(np.where(is_close, to_numpy(volumes[0][box], None), 0), volumes[0])
+                    image = cast_like(images[index][m : m + 1], volumes[0])
+                    gradient += to_numpy(A._mu_gradient(image, voxels, volumes[1]), None)
+            total += to_caller(self._as_result(gradient, images), images)
         return total
 
-    def _responded(self, images: ArrayOrTensor) -> ArrayOrTensor:
-        """`images` with the adjoint of the detector's response and efficiency."""
+    def _response_adjoint(self, images: ArrayOrTensor) -> ArrayOrTensor:
+        """Return the adjoint of the detector's response and efficiency for `images` (M, n_v, n_u)."""
         if self._efficiency is not None:
             images = images * cast_like(self._efficiency, images)
         for m in range(len(self.views)):
@@ -339,93 +348,96 @@ class Projector(LinearOperator):
             if response is None:
                 return images
             if m == 0:
-                images = images + 0  # a copy: the caller's stay as they are
+                images = images + 0  # a copy: the caller's images stay as they are
             along_v, along_u = (cast_like(matrix, images) for matrix in response)
             images[m] = along_v.T @ images[m] @ along_u
         return images
 
-    def _bundle(self, m: int) -> Bundle:
-        return Bundle.along(self.grid, *self.model.beams(self.views, m, self.grid))
+    def _bundle(self, m: int) -> RayBundle:
+        """Return the rays of view m."""
+        return RayBundle.along(self.grid, *self.model.beams(self.views, m, self.grid))
 
     def _execution(self, x: ArrayOrTensor) -> Execution:
-        """What computes with the rays, for an array or tensor such as `x`."""
+        """Return the execution that traces the rays, for arrays or tensors such as `x`."""
         on_gpu = self._auto and is_tensor(x) and x.device.type != "cpu"
         backend = backends.for_tensor(x) if on_gpu else self._backend
         mu_grid = None if self.model.mu is None else self.model.mu.grid
         float64 = self._float64 or backend.always_float64 or is_double(x)
         return Execution(backend, self.grid, mu_grid, float64, self.threads)
 
-    def _depth_arguments(self, x: ArrayOrTensor) -> tuple[ArrayOrTensor, Any, int]:
-        """What `WholeHoles` takes: the array, the functions and the threads."""
+    def _pinhole_arguments(self, x: ArrayOrTensor) -> tuple[ArrayOrTensor, Any, int]:
+        """Return the arguments of a `PinholeOperator`: `x` as an array, the module that computes, and the threads."""
         double = self._float64 or self._backend.always_float64 or is_double(x)
-        has_kernels = self._backend.name != "numpy" and backends.choose("auto").name == "cpu"
-        functions = backends.load("cpu" if has_kernels else "reference_depth")
-        return np.ascontiguousarray(to_numpy(x, np.float64 if double else np.float32)), functions, self.threads
-
-    def _depth_mu_gradient(
-        self, images: ArrayOrTensor, responded: ArrayOrTensor, x: ArrayOrTensor, mu: ArrayOrTensor
-    ) -> Array:
-        """The gradient by mu of the depth-dependent response, and of the voxels that are too close to a pinhole for it."""
-        volume, *how = self._depth_arguments(x)
-        arguments = volume, to_numpy(responded, None), *how, self._mu_field(mu)
-        gradient: Array = self._depths.mu_gradient(*arguments)  # type: ignore[union-attr]
-        for m, box, close, of_part in self._close_parts:
-            part, image = cast_like(np.where(close, to_numpy(x[box], None), 0), x), cast_like(images[m : m + 1], x)
-            gradient += to_numpy(of_part._mu_gradient(image, part, mu), None)
-        return gradient
+        array = np.ascontiguousarray(to_numpy(x, np.float64 if double else np.float32))
+        return array, depth_backend(self._backend.name), self.threads
 
     @functools.cached_property
     def _efficiency(self) -> Array | None:
-        """That of the model, (M, n_v, n_u) or (M, 1, 1); None where it is 1."""
-        values = each_pixel(self.model.efficiency)
+        """Efficiency of the model, (M, n_v, n_u) or (M, 1, 1); None if it is 1 everywhere."""
+        values = with_image_axes(self.model.efficiency)
         return None if np.all(values == 1) else np.broadcast_to(values, (len(self.views), *values.shape[1:]))
 
     @functools.cached_property
     def _close_parts(self) -> list[tuple[int, Any, NDArray[np.bool_], Projector]]:
-        """The voxels so close to a pinhole that rays project them: view, a box of the grid, which in it, their projector."""
+        """Voxels too close to a pinhole for its response: view, box of the grid, mask in the box, projector by rays."""
         parts = []
         for m in range(len(self.views)):
-            found = None if self._depths is None else self._depths.close(m)
-            if found is not None:
-                box, close = found
-                grid, which = self.grid.box([each.start for each in box], close.shape), np.array([m])
-                model = self.model.of_views(which).by_rays()
+            close = None if self._pinholes is None else self._pinholes.close_voxels(m)
+            if close is not None:
+                box, is_close = close
+                grid, view = self.grid.box([part.start for part in box], is_close.shape), np.array([m])
+                model = self.model.of_views(view).by_rays()
                 with recorded_warnings():
-                    parts.append((m, box, close, Projector(grid, self.views[which], model, **self._settings)))
+                    parts.append((m, box, is_close, Projector(grid, self.views[view], model, **self._settings)))
         return parts
 
-    def _mu_field(self, mu: ArrayOrTensor) -> Field | None:
-        """`mu` on the grid of the model's."""
-        return None if mu is None else Field(to_numpy(mu, None), self.model.mu.grid)  # type: ignore[union-attr]
+    def _mu_on_grid(self, mu: ArrayOrTensor) -> ArrayOnGrid | None:
+        """Return `mu` with the grid of the model's."""
+        return None if mu is None else ArrayOnGrid(to_numpy(mu, None), self.model.mu.grid)  # type: ignore[union-attr]
 
     def _mu(self, mu: ArrayOrTensor) -> ArrayOrTensor:
+        """Return `mu`, or the model's if that is None."""
         return self.model.mu.array if mu is None and self.model.mu is not None else mu
 
-    def _bundles_of(self, m: int) -> Bundles:
-        """The rays of view m alone."""
+    def _view_bundles(self, m: int) -> Bundles:
+        """Return the rays of view m alone."""
         return Bundles(1, lambda _: self._bundles[m])
 
-    def _voxel_weights(self, m: int, like: ArrayOrTensor) -> ArrayOrTensor:
-        return cast_like(self.model.voxel_weights(self.views, m, self.grid), like)
+    def _voxel_weights(self, m: int, values: ArrayOrTensor) -> ArrayOrTensor:
+        """Return the model's factors of the voxels in view m, an array or tensor as `values`."""
+        return cast_like(self.model.voxel_weights(self.views, m, self.grid), values)
 
     def _extra_bytes(self, itemsize: int) -> int:
-        """Bytes of a copy of mu, and of voxel weights and the volume that they weight."""
+        """Return the bytes of a copy of mu, and of voxel weights with the weighted volume."""
         if self._parts:
             return max(part._extra_bytes(itemsize) for part in self._parts)
         mu = 0 if self.model.mu is None else self.model.mu.grid.n_voxels
         return itemsize * mu + (2 * itemsize + 8) * self.grid.n_voxels * self.model.weights_voxels
 
     def _require_rays(self) -> None:
+        """Raise `InputError` if there is too little memory for an image and its rays."""
         n_v, n_u = self.views.shape
         # An image of float32, and some arrays of float64 from which the weights of its rays are made.
         self._require(110 * n_v * n_u, f"an image of {n_v} x {n_u} pixels, with its rays,")
 
-    def _finished(self, result: ArrayOrTensor, x: ArrayOrTensor) -> ArrayOrTensor:
-        """`result` as float32, unless it is to be float64 (where "auto" falls back to numpy it is not)."""
+    def _as_result(self, result: ArrayOrTensor, x: ArrayOrTensor) -> ArrayOrTensor:
+        """Return `result` as float32, unless float64 is asked for; numpy in place of "auto" computes in float64 unasked."""
         if self._float64 or is_tensor(result) or is_double(x):
             return result
         return result.astype(np.float32, copy=False)
 
 
+def _warnings(grid: Grid, views: Views, model: Model) -> Iterator[str]:
+    """Yield the warnings about a projector's arguments that look wrong, each with its number."""
+    if caution := model.caution(views, grid):
+        yield caution
+    width = float(np.ptp(grid.corners(), axis=0).max())
+    if width < _NARROW and max(grid.shape) > 3:
+        distance = float(np.linalg.norm(views.sources - grid.center, axis=1).min())
+        yield f"the grid is {width:.3g} mm wide, {distance:.3g} mm from the sources: lengths are in mm; is it in metres?"
+    yield from model.coefficient_warnings()
+
+
 def _describe(grid: Grid) -> str:
+    """Return a grid's shape and spacing in words."""
     return f"{shape_text(grid.shape)} voxels of {' x '.join(f'{s:.6g}' for s in grid.spacing)} mm"

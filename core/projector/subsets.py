@@ -1,4 +1,4 @@
-"""Subsets of views that each look at the object from all sides, for algorithms that use one subset at a time."""
+"""Subsets of views for algorithms that use one subset at a time; each subset sees the object from all sides."""
 
 from typing import TypeVar
 
@@ -12,14 +12,14 @@ from ..validation import whole_number
 
 _Subset = TypeVar("_Subset")
 
-_RING_GAP = 0.02  # of the sources' mean distance from the origin: those that differ less in z form a ring
+_RING_GAP = 0.02  # difference in z below which sources form a ring, in units of their mean distance from the origin
 
 
 def balanced_subsets(views: Views, n: int) -> list[NDArray[np.int64]]:
-    """Indices of `n` subsets of the views, balanced over rings and angles; their sizes differ by one at most.
+    """Return the indices of `n` subsets of the views, balanced over rings and angles; their sizes differ by one at most.
 
-    The views are dealt out like cards, ring by ring along z, each ring by the sources' angle around z; each ring begins
-    farther on than the one before, so that a subset does not have the same angle of every ring.
+    The views are dealt out like cards, ring by ring along z, each ring by the sources' angle around z. Each ring begins
+    at another angle than the ring before, so that a subset does not have the same angle of every ring.
     """
     n = whole_number(n, "subsets")
     if n > len(views):
@@ -36,9 +36,9 @@ def balanced_subsets(views: Views, n: int) -> list[NDArray[np.int64]]:
 
 
 def access_order(n: int) -> list[int]:
-    """An order of `n` subsets in which neighbours look from directions that are far apart.
+    """Return an order of `n` subsets in which neighbours see the object from directions that are far apart.
 
-    Steps of about the golden section of `n` that have no divisor in common with it.
+    It goes in steps of about the golden section of `n` that have no divisor in common with it.
     """
     steps = [step for step in range(1, n + 1) if np.gcd(step, n) == 1]
     step = min(steps, key=lambda step: abs(step - n * (3 - 5**0.5) / 2))
@@ -46,5 +46,5 @@ def access_order(n: int) -> list[int]:
 
 
 def in_access_order(subsets: list[_Subset]) -> list[_Subset]:
-    """What belongs to each subset, in the order in which they are used."""
+    """Return a list with an item for each subset, reordered by `access_order`."""
     return [subsets[s] for s in access_order(len(subsets))]

@@ -12,7 +12,7 @@ from ..geometry.views import Views
 from ..memory import require
 from ..perspective.places import gather
 from ..progress import Progress, tell
-from ..projector.parallel import run_all, thread_count
+from ..rays.parallel import run_all, thread_count
 from ..validation import instance, real_array
 from .loop import plain
 from .ramp import ramp_matrix

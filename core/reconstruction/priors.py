@@ -11,8 +11,8 @@ from ..arrays import Array, Bools, Bytes
 from ..errors import InputError
 from ..geometry.grid import Grid
 from ..memory import require
-from ..projector.lattices import same_lattice
-from ..projector.parallel import run_all, thread_count
+from ..rays.lattices import same_lattice
+from ..rays.parallel import run_all, thread_count
 from ..validation import at_least_0, instance, one_of, positive, whole_number
 from ..volumes.volume import Volume
 

@@ -8,10 +8,10 @@ import numpy as np
 from ..arrays import Floats, Floats32
 from ..errors import InputError
 from ..geometry.grid import Grid
+from ..models.model import with_image_axes
 from ..perspective.backprojection import HOW, backproject
 from ..progress import Stages
 from ..projector import Emission
-from ..projector.models import each_pixel
 from ..validation import instance, one_of
 from ..volumes.volume import Volume
 from .recipe import Recipe
@@ -108,8 +108,8 @@ def _pixel_weights(run: ProjectionRun) -> Floats:
     middle = replace(model, hole="point", aperture_points=None, aperture_tolerance=None, pixel_points=1, depth_layers=1)
     anywhere = Grid.centered((1, 1, 1), 1.0)  # weights do not depend on it
     every = slice(None)
-    return each_pixel(model.efficiency) * np.array([
-        sum(beam.weigh(every, every, every).sum(axis=0) for beam in middle.beams(run.views, m, anywhere))  # type: ignore[misc]
+    return with_image_axes(model.efficiency) * np.array([
+        sum(beam.weights(every, every, every).sum(axis=0) for beam in middle.beams(run.views, m, anywhere))  # type: ignore[misc]
         for m in range(len(run.views))
     ])  # fmt: skip
 

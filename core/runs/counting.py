@@ -11,8 +11,8 @@ from ..arrays import Array, Floats
 from ..errors import InputError, reading
 from ..files import AnyPath, require_file
 from ..hdf5 import datasets, opened, read_numbers
+from ..models.model import with_image_axes
 from ..physics.dead_time import live_shares
-from ..projector.models import each_pixel
 from ..volumes.formats import numpy_files
 from .recipe import Recipe
 
@@ -60,5 +60,5 @@ def scaled(values: float | Floats, shares: Array) -> float | Floats:
     """Efficiencies or a background, of any of their forms, times shares (M, 1, 1) of modules."""
     if np.all(shares == 1):
         return values
-    found = each_pixel(values) * shares
+    found = with_image_axes(values) * shares
     return found if np.ndim(values) == 3 else found[:, 0, 0]

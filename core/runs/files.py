@@ -208,7 +208,7 @@ def _packed_npz(described: _Arrays, attributes: dict[str, Any]) -> memoryview:
     """Arrays by name, attributes as JSON text."""
     arrays = {name: array for name, (_, array) in described.items()}
     text = json.dumps({**attributes, _SHA256: _sha256(arrays, attributes)})
-    return numpy_files.packed({**arrays, _ATTRIBUTES: np.array(text)})
+    return numpy_files.pack_npz({**arrays, _ATTRIBUTES: np.array(text)})
 
 
 def _read_npz(path: Path) -> _Contents:

@@ -22,7 +22,7 @@ from ..progress import Progress, tell
 from ..recording import recorded_warnings
 from ..validation import one_of, shape_text, whole_shape
 from ..volumes.formats import metaimage, numpy_files
-from ..volumes.formats.dicom import TOMOGRAMS, decoded, image_kind, is_dicom, require_grey
+from ..volumes.formats.dicom import TOMOGRAMS, decode_pixels, image_kind, is_dicom, require_grey
 
 RAW_TYPES = ("uint8", "int8", "uint16", "int16", "uint32", "int32", "uint64", "int64", "float32", "float64")
 """Types of the numbers in raw files."""
@@ -338,7 +338,7 @@ def _dicom(path: Path, layout: Layout) -> Counts:
     require_grey(data)
     shape = int(data.get("NumberOfFrames") or 1), int(data.Rows), int(data.Columns)
     _require_memory(shape, 4)
-    array = decoded(data).reshape(shape)
+    array = decode_pixels(data).reshape(shape)
     slope, intercept = float(data.get("RescaleSlope") or 1), float(data.get("RescaleIntercept") or 0)
     if (slope, intercept) != (1.0, 0.0):
         array = array * slope + intercept

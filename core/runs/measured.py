@@ -17,8 +17,8 @@ from ..errors import InputError, expecting, naming, number_ranges, warn
 from ..files import read_text
 from ..geometry.scanner import Detector, Scanner
 from ..memory import require
+from ..models.model import checked_background, checked_times, with_image_axes
 from ..progress import Stages
-from ..projector.models import checked_background, checked_times, each_pixel
 from ..validation import instance, one_of, real_numbers, require_finite, shape_text
 from .counting import live_shares_of, recipe_efficiency, scaled
 from .frame_checks import warn_of_frames
@@ -137,7 +137,7 @@ def counts_run(
     if scatter is not None:
         estimate, record["scatter"] = scatter.estimate(of_windows, frames_of, found, efficiency)
     background = scaled(made["model.background"], live_shares_of(made, images, record))
-    background = background if estimate is None else each_pixel(background) + estimate
+    background = background if estimate is None else with_image_axes(background) + estimate
     known: Any = {"settings": record, "background": background, "efficiency": efficiency}
     run = ProjectionRun(images, system, views, unit="counts", **known)
     _warn_of_others(found, used, words, run)
@@ -277,7 +277,7 @@ def _declared(run: ProjectionRun, words: list[str], used: list[int], shape: tupl
     found = np.zeros(shape, bool)
     if np.all(run.efficiency):
         return found
-    living = np.broadcast_to(each_pixel(run.efficiency) > 0, run.projections.shape)
+    living = np.broadcast_to(with_image_axes(run.efficiency) > 0, run.projections.shape)
     if run.settings["detector"] == "virtual":
         living = living[:, ::-1, ::-1]
     for k, lives in zip(used, living, strict=True):

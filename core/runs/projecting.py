@@ -12,12 +12,12 @@ from ..geometry.scanner import Detector, Scanner
 from ..geometry.system import PinholeSystem
 from ..geometry.views import Views
 from ..memory import require
+from ..models.coefficient_checks import mu_warnings
 from ..physics.dead_time import dead_time_counts
 from ..physics.isotopes import photon_energy
 from ..physics.noise import sample_counts
 from ..progress import Progress
 from ..projector import Emission, Model, Projector, Transmission, intensity
-from ..projector.doubts import doubts_of_mu
 from ..validation import positive, seed_number
 from ..volumes.volume import Volume
 from ..xray.scan import SpectralScan
@@ -74,8 +74,8 @@ class Imaging:
             raise InputError(f"photons: expected the transmission of a volume of mu, got {what}")
         warn_of_images(volume, A.views, self.model)
         if mu is not None and isinstance(self.model, Emission):
-            for doubt in doubts_of_mu(mu, self.model):
-                warn(doubt)
+            for text in mu_warnings(mu, self.model):
+                warn(text)
         if isinstance(self.model, SpectralScan):
             images = self.model.counts(volume, A, progress)
         else:

@@ -12,11 +12,11 @@ from ..errors import InputError, warn
 from ..geometry.grid import Grid
 from ..geometry.system import PinholeSystem
 from ..memory import require
+from ..models.photon_lines import Mu
 from ..phantoms.derenzo import DerenzoRods
 from ..physics.performance import resolution
 from ..progress import Stages
-from ..projector.backends import choose
-from ..projector.photon_lines import Mu
+from ..rays.backends import choose
 from ..reconstruction.methods import METHODS, PRIORS, Choice, Method, method_of
 from ..reconstruction.result import Reconstruction
 from ..reconstruction.stopping import StoppingRule, StopWhen

@@ -13,7 +13,7 @@ from ..arrays import Floats, Floats32, checked
 from ..errors import InputError
 from ..geometry.scanner import Scanner
 from ..geometry.views import Views
-from ..projector.models import checked_background
+from ..models.model import checked_background
 from ..validation import freeze, real_numbers
 from ..version import VERSION
 from ..volumes.volume import Volume
@@ -26,7 +26,7 @@ def versions() -> dict[str, str]:
     with contextlib.suppress(metadata.PackageNotFoundError):
         found["torch"] = metadata.version("torch")
     with contextlib.suppress(ImportError, OSError):  # there is none for this platform
-        from ..projector.backends import cpu
+        from ..rays.backends import cpu
 
         found["cpu"] = cpu.levels()[cpu.level]
     return found

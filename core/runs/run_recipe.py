@@ -15,6 +15,8 @@ from ..geometry.grid import Grid
 from ..geometry.scanner import Scanner
 from ..geometry.system import chosen_modules
 from ..geometry.views import Views
+from ..models.model import with_image_axes
+from ..models.photon_lines import Mu, mu_from_volumes, mu_volumes, require_one_per_line
 from ..phantoms.kinds import KINDS
 from ..phantoms.language import parse_phantom, read_phantom
 from ..phantoms.phantom import Phantom
@@ -23,8 +25,6 @@ from ..physics.ct_numbers import hu_to_mu
 from ..physics.isotopes import photon_energy
 from ..progress import Progress, Stages
 from ..projector import Emission, InverseSquareSum, Model, Projector, Transmission
-from ..projector.models import each_pixel
-from ..projector.photon_lines import Mu, each_mu, mu_of, require_each
 from ..volumes.rearranging import centered
 from ..volumes.volume import Volume
 from ..volumes.volume_files import read_volume, read_volume_of
@@ -187,7 +187,7 @@ def recipe_model(recipe: Recipe, system: Scanner, mu: Mu | None = None, run: Pro
             given |= {name: scaled(given.get(name, 0.0), shares) for name in ("background", "efficiency")}
     model: Model = cls(**given) if cls is Transmission else cls(system, **given)
     if isinstance(model, Emission) and len(files := recipe["attenuation.file"] or ()) > 1:
-        require_each(len(files), model.photon_lines, "attenuation.file", "file")
+        require_one_per_line(len(files), model.photon_lines, "attenuation.file", "file")
         if recipe["attenuation.energy"] is not None:
             raise InputError("attenuation.energy: it is for one file of CT numbers; a file for each line holds mu")
     return model
@@ -240,8 +240,8 @@ def projector_of_run(
         model = Transmission()
     if isinstance(model, Emission) and np.ndim(run.background) == 3:  # such as scatter: no recipe says it
         own = recipe_model(run.recipe, run.system, run=run).background if "recipe" in run.settings else 0.0
-        more = np.maximum(run.background - each_pixel(own), 0)
-        model = replace(model, background=each_pixel(model.background) + more)
+        more = np.maximum(run.background - with_image_axes(own), 0)
+        model = replace(model, background=with_image_axes(model.background) + more)
     return Projector(grid, run.views, model, backend, threads)
 
 
@@ -276,7 +276,7 @@ def mu_of_files(recipe: Recipe, model: Model, read: Callable[[str], Volume]) -> 
     for path in recipe["attenuation.file"] or ():
         warn_of_energy(model, recipe["attenuation.energy"], Path(path).name)
         found.append(read(path))
-    return mu_of(found)
+    return mu_from_volumes(found)
 
 
 def _from_files(recipe: Recipe, record: Recipe, model: Model, mu: Mu | None, stages: Stages) -> Iterator[_Source]:
@@ -288,7 +288,7 @@ def _from_files(recipe: Recipe, record: Recipe, model: Model, mu: Mu | None, sta
         if recipe["volume.center"]:
             if middle is None:
                 middle = volume.grid.center
-                mu = mu_of([centered(one, one.grid.center - middle) for one in each_mu(mu)])
+                mu = mu_from_volumes([centered(one, one.grid.center - middle) for one in mu_volumes(mu)])
             volume = centered(volume, volume.grid.center - middle)
         yield volume, mu, record if states is None else record.updated({"volume.states": [file]})
 

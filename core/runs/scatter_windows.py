@@ -8,9 +8,9 @@ import numpy as np
 
 from ..arrays import Floats, Floats32
 from ..errors import InputError
+from ..models.model import with_image_axes
 from ..physics.energy_window import energy_window_scatter, peak_shares
 from ..physics.isotopes import isotope
-from ..projector.models import each_pixel
 from .frame_files import Counts, differs
 
 _WORDS = ("lower", "peak", "upper")
@@ -75,7 +75,7 @@ class ScatterWindows:
         if self.isotope is not None and self.energy_fwhm is not None:
             edges = [None if word not in used else self._edges(word, used[word], found) for word in _WORDS]
             shares = peak_shares(isotope(self.isotope), edges, self.energy_fwhm)
-        scatter, _ = energy_window_scatter(lower, peak, upper, widths, self.fwhm, each_pixel(efficiency), shares)
+        scatter, _ = energy_window_scatter(lower, peak, upper, widths, self.fwhm, with_image_axes(efficiency), shares)
         scatter = scatter.clip(min=0)  # a background cannot be less
         beside = sum(images[word].sum(axis=(1, 2), dtype=float) for word in self.frames)
         record = {"windows": sorted(self.frames), "widths_keV": widths, "fwhm_pixels": self.fwhm}

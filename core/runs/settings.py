@@ -17,11 +17,11 @@ from types import MappingProxyType
 from typing import Any
 
 from ..errors import InputError
-from ..phantoms.kinds import KINDS, Kind
+from ..phantoms.kinds import KINDS, PhantomKind
 from ..phantoms.settings import setting_names
 from ..physics.isotopes import ISOTOPES
 from ..physics.materials import APERTURES, CRYSTALS
-from ..projector.backends import BACKENDS, OLD_NAMES
+from ..rays.backends import BACKENDS, OLD_NAMES
 from ..reconstruction.methods import METHOD_FILES, METHODS, PRIORS
 from ..validation import real_array
 from ..volumes.volume import LINE_INTEGRALS
@@ -144,7 +144,7 @@ class OwnSetting(Setting):
         return tuple(value) if isinstance(value, list) else value
 
 
-def own_settings(kind: Kind, row: type[Setting] = OwnSetting, **common: Any) -> list[Setting]:
+def own_settings(kind: PhantomKind, row: type[Setting] = OwnSetting, **common: Any) -> list[Setting]:
     """The settings of a kind of phantoms, as rows of a class; `common` is what all of them have."""
     fields = {field.name: field for field in dataclasses.fields(kind.phantom)}
     found = []

@@ -1,4 +1,4 @@
-"""Images that know what they are of."""
+"""Images of line integrals, labelled with the quantity of their volume."""
 
 from typing import Any
 
@@ -8,14 +8,14 @@ from ..arrays import Array
 
 
 class Images(np.ndarray):  # type: ignore[type-arg]
-    """Line integrals that know of which quantity they are, as do parts of them and what is calculated from them.
+    """Line integrals with the `quantity` of their volume, which slices and results of calculations keep.
 
-    Files, tensors and other programs do not; read again, they are of "mu".
+    Files, tensors and other programs lose the label; images read from them have the quantity "mu".
     """
 
     @classmethod
-    def of(cls, array: Array, quantity: str) -> "Images":
-        """The same numbers, of a volume's quantity."""
+    def tag(cls, array: Array, quantity: str) -> "Images":
+        """Return a view of `array` as images of a volume of this `quantity`."""
         images = array.view(cls)
         images.quantity = quantity
         return images
@@ -23,5 +23,5 @@ class Images(np.ndarray):  # type: ignore[type-arg]
     def __array_finalize__(self, source: Any) -> None:
         self.quantity = getattr(source, "quantity", "mu")
 
-    def __array_wrap__(self, array: Any, *more: Any) -> Any:
-        return super().__array_wrap__(array, *more) if array.ndim else array[()]  # sums are numbers
+    def __array_wrap__(self, array: Any, *context: Any) -> Any:
+        return super().__array_wrap__(array, *context) if array.ndim else array[()]  # a sum becomes a plain number

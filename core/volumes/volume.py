@@ -1,4 +1,4 @@
-"""A volume: an array on a grid, and the quantity that it holds."""
+"""Volumes: arrays of voxel values on a grid, with the quantity of the values."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -21,61 +21,66 @@ UNITS = {
     "completeness": "1",
     "dose_rate": "mGy/h",  # absorbed dose (core.xray.dose)
     "dose": "mGy",
-    "backprojection": "images' unit",  # of what views say together (core.perspective.backprojection)
+    "backprojection": "images' unit",  # combination of the images of several views (core.perspective.backprojection)
 }
-"""The quantities that a volume may hold, and their units."""
+"""Units of a volume's values, by quantity."""
 
 AIR_HU = -1000.0
-"""CT number of air."""
+"""CT number of air, HU."""
 
 LINE_INTEGRALS = ("activity", "mu")
-"""Quantities whose line integrals have a meaning. CT numbers have none, because air is -1000, nor have maps."""
+"""Quantities with meaningful line integrals: not CT numbers, because air is -1000 HU, and not maps."""
 
 CONVERT = (
     "; convert its CT numbers first: hu_to_mu(volume, energy), `mphdrr volume convert FILE --to-mu --energy KEV`, or "
     "CT to Attenuation in Blender's Phantom panel"
 )
+"""Advice for messages that refuse a volume of CT numbers."""
 
 
 @dataclass(frozen=True, eq=False)
 class Volume:
-    """Voxel values on a grid. Outside the grid they are 0.
+    """Voxel values on a grid; outside the grid the values are 0.
 
-    The float32 `array` (n_x, n_y, n_z) is read-only, in C order, and indexed ``[ix, iy, iz]``; one that is so already is
-    kept, any other is copied. The `quantity` is ``"activity"`` (kBq/mL), ``"mu"`` (1/mm), ``"hu"``, or another of
-    `UNITS`.
+    An array that is float32, read-only and in C order is kept; any other array is copied.
     """
 
     array: Floats32
+    """Values (n_x, n_y, n_z), float32, read-only, indexed ``[ix, iy, iz]``."""
     grid: Grid
+    """Grid of the voxels."""
     quantity: str = "activity"
+    """Quantity of the values, a key of `UNITS`: ``"activity"`` (kBq/mL), ``"mu"`` (1/mm), ``"hu"``, ..."""
     note: str = ""
-    """What who sees it should know, such as that a network made it: files that are written of it say so."""
+    """Note for readers, such as that a network made the volume; it is written into files."""
 
     def __post_init__(self) -> None:
         instance(self.grid, Grid, "grid")
         one_of(self.quantity, UNITS, "quantity")
-        given = real_numbers(self.array, "volume")
-        fits = (given.dtype, given.shape) == (np.float32, self.grid.shape)
-        if fits and given.flags.c_contiguous and not given.flags.writeable:
-            require_finite(given, "volume")
+        values = real_numbers(self.array, "volume")
+        fits = (values.dtype, values.shape) == (np.float32, self.grid.shape)
+        if fits and values.flags.c_contiguous and not values.flags.writeable:
+            require_finite(values, "volume")
         else:
-            given = freeze(real_array(given, "volume", self.grid.shape, np.float32))
-        object.__setattr__(self, "array", given)
+            values = freeze(real_array(values, "volume", self.grid.shape, np.float32))
+        object.__setattr__(self, "array", values)
 
     @property
     def unit(self) -> str:
-        """The unit of the values."""
+        """Unit of the values."""
         return UNITS[self.quantity]
 
 
-def require_quantity(quantity: str, taken: Sequence[str], name: str) -> None:
-    """Refuse a `quantity` that is none of those `taken` by `name`; for CT numbers the message says how to convert them."""
-    if quantity not in taken:
-        advice = CONVERT if quantity == "hu" and "mu" in taken else ""
-        raise InputError(f"{name}: expected a volume of {' or '.join(taken)}, got {quantity}{advice}")
+def require_quantity(quantity: str, allowed: Sequence[str], name: str) -> None:
+    """Raise `InputError` unless a volume's `quantity` is one of those `allowed`.
+
+    The message begins with `name`, such as a function's; for CT numbers it says how to convert them to mu.
+    """
+    if quantity not in allowed:
+        advice = CONVERT if quantity == "hu" and "mu" in allowed else ""
+        raise InputError(f"{name}: expected a volume of {' or '.join(allowed)}, got {quantity}{advice}")
 
 
 def outside_value(volume: Volume) -> float:
-    """Default value outside the grid when a volume is resampled or padded: -1000 for CT numbers, else 0."""
+    """Return the default value outside the grid when a volume is resampled or padded: -1000 for CT numbers, else 0."""
     return AIR_HU if volume.quantity == "hu" else 0.0

@@ -1,4 +1,4 @@
-"""Volumes in files: the formats by their endings, and one clear line for every file that cannot be read."""
+"""Read and write volumes in files, in the format of the name's ending; unreadable files give one clear line."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -10,7 +10,7 @@ from ..files import AnyPath, find_ending, replacing, require_ending, require_fil
 from ..progress import Progress
 from ..validation import instance, real_array
 from .formats import dicom, hdf5, metaimage, nifti, nrrd, numpy_files
-from .formats.contents import Contents
+from .formats.contents import VolumeFileContents
 from .volume import UNITS, Volume
 
 _READERS = {
@@ -27,9 +27,9 @@ _WRITERS = {
     **dict.fromkeys((".h5", ".hdf5"), hdf5.write),
 }
 VOLUME_FORMATS = tuple(_WRITERS)
-"""Endings that `write_volume` writes."""
+"""Name endings of the formats that `write_volume` writes."""
 READ_FORMATS = (*_READERS, ".dcm")
-"""Endings that `read_volume` reads, besides folders of DICOM files and DICOM files of any name."""
+"""Name endings of the formats that `read_volume` reads, besides folders of DICOM files and DICOM files of any name."""
 
 
 def read_volume(
@@ -47,25 +47,25 @@ def read_volume(
     Parameters
     ----------
     path
-        The file. For a DICOM series: its folder, or any of its files.
+        Path of the file; for a DICOM series, of its folder or any of its files.
     quantity
-        What the values are: one of `UNITS`, such as ``"activity"`` (kBq/mL), ``"mu"`` (1/mm) or ``"hu"``. Default: what
-        the file says, or ``"hu"`` if it says nothing.
+        Quantity of the values: one of `UNITS`, such as ``"activity"`` (kBq/mL), ``"mu"`` (1/mm) or ``"hu"``. Default: the
+        quantity stated in the file, or ``"hu"`` if it states none.
     affine
-        Index to world mm (4, 4), instead of the file's own; .npy files need it.
+        Affine world-from-index (4, 4), mm, that replaces the file's own; .npy files need it.
     series
         Number, description or UID of one of several DICOM series in the folder.
     progress
         Called as ``progress(done, total)`` with the slices of a DICOM series; may raise `Cancelled`.
     """
     path = Path(path)
-    contents = _contents(path, series, progress)
+    contents = _read_contents(path, series, progress)
     with naming(path):
         if affine is not None:
             contents = replace(contents, affine=real_array(affine, "affine", (4, 4)))
         if contents.quantity is not None and contents.quantity not in UNITS and quantity is None:
             raise InputError(f"it holds {contents.quantity!r}: say which quantity that is, one of {', '.join(UNITS)}")
-        return contents.volume(quantity or contents.quantity or "hu")
+        return contents.to_volume(quantity or contents.quantity or "hu")
 
 
 def read_volume_of(
@@ -76,16 +76,17 @@ def read_volume_of(
     series: str | None = None,
     progress: Progress | None = None,
 ) -> Volume:
-    """Read a volume that has to hold `quantity`, as `read_volume` does; a file that does not say so is taken for that.
+    """Read a volume of a required `quantity`; a file that states another one raises `InputError`.
 
-    A file that says another quantity is refused; `advice` ends the message.
+    A file that states no quantity is taken to hold the required one. `advice` ends the error message; `series` and
+    `progress` are those of `read_volume`.
     """
     path = Path(path)
-    contents = _contents(path, series, progress)
+    contents = _read_contents(path, series, progress)
     with naming(path):
         if contents.quantity in UNITS and contents.quantity != quantity:
             raise InputError(f"it holds {contents.quantity}, expected {quantity} in {UNITS[quantity]}{advice}")
-        return contents.volume(quantity)
+        return contents.to_volume(quantity)
 
 
 def write_volume(volume: Volume, path: AnyPath) -> None:
@@ -97,8 +98,8 @@ def write_volume(volume: Volume, path: AnyPath) -> None:
         write(volume, temporary)
 
 
-def _contents(path: Path, series: str | None, progress: Progress | None) -> Contents:
-    """What the file or folder at `path` holds."""
+def _read_contents(path: Path, series: str | None, progress: Progress | None) -> VolumeFileContents:
+    """Read the voxels of the file or DICOM folder at `path`, and what it states about them."""
     with refusing(path, "cannot be read"):
         is_folder = path.is_dir()
     if not is_folder:

@@ -1,12 +1,16 @@
-"""The users' geometry workbook (.xlsx): the pinholes' coordinates and their dimensions, and scanners of other kinds.
+"""Reader and writer of the users' geometry workbook (.xlsx): pinholes, and scanners of other kinds.
 
-Which columns there are is declared in `core.geometry`: `pinhole_columns`, and the table of another kind.
+Begin with `read_system` and `write_system`, or `draft_column_map` for a workbook whose headings are not understood. The
+columns are declared in `core.geometry.pinhole_columns`, or in the table of another kind of scanner.
 
-Both ways:   book, sheet_xml, workbook_xml and package (the file), calculation and formulas (the values of its formulas),
-             agreement (when a cell's value is right)
-Reading:     headings, headed_table and recognition (what a workbook's headings say, and doubts), column_map and draft (what
-             a person says), layout (which cells hold which column), reader
-Writing:     writer, edit (the cells that change, and the rows that move with the modules)
+- The file: `package` (zip and XML), `sheet_xml` and `workbook_xml` (cells, written back without touching other bytes),
+  `formulas` and `calculation` (values of formulas), `book` (all this as sheets with values), `agreement` (equal values).
+- Reading: `headings`, `headed_table` and `recognition` (meaning of the headings, and doubts about it), `column_map` and
+  `draft` (meaning given by a person), `layout` (cells of each column), `reader`.
+- Writing: `writer`, `edit` (changed cells, and rows that move with the modules), `new_workbook`.
+
+To add a column, see docs/structure.md; a function for formulas is a line of a table in `formulas`, a word for a unit one in
+`headings`.
 """
 
 from ..system_source import QuantityCells, SystemSource

@@ -1,4 +1,4 @@
-"""A column map: what a person says about the cells of a workbook where its headings do not. Kept as TOML."""
+"""Column map: a table, kept as TOML, in which a person says what the cells of a workbook hold if its headings do not."""
 
 from __future__ import annotations
 
@@ -14,10 +14,11 @@ from ..geometry.columns import ColumnTable
 from ..geometry.scanner import Scanner
 from ..scanner_kinds import scanner_kind
 from ..toml import parse_toml, read_toml, toml_value
-from .headings import unit_of
+from .headings import parse_unit
 from .sheet_xml import MAX_COLUMN, MAX_ROW
 
-Joined = Literal["by number", "in order", "one for all"]
+RowMatching = Literal["by number", "in order", "one for all"]
+"""How the rows of a table are matched with the rows of the first table."""
 
 _HELP = "see docs/workbook.md"
 _KEYS = {"sheet": str, "header_row": int, "first_row": int, "last_row": int, "skip_rows": list}
@@ -26,20 +27,23 @@ _KEYS |= {"rows": str, "number": str, "columns": dict}
 
 @dataclass(frozen=True)
 class MappedColumn:
-    """A column of a sheet: the name of the scanner's column in it, such as x1, Td or azimuth, its letters and the unit."""
+    """Column of a sheet that holds a column of the scanner."""
 
     quantity: str
+    """Name of the scanner's column, such as x1, Td or azimuth."""
     column: str
+    """Letters of the sheet's column."""
     unit: str
     """mm, cm, m, in, µm, dm, ft, mil or 0.1 mm; rad or deg. Empty for texts and plain numbers, and in a draft if unknown."""
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "unit", unit_of(self.unit) or self.unit)  # "um" and "inches" are units, too
+        """Replace a word for a unit, such as "um" or "inches", by the unit."""
+        object.__setattr__(self, "unit", parse_unit(self.unit) or self.unit)
 
 
 @dataclass(frozen=True)
 class MappedTable:
-    """Rows of a sheet, and what their columns hold. Every row from the first to the last holds a module."""
+    """Rows of a sheet, and the columns in them. Every row from the first to the last that is not skipped holds a module."""
 
     sheet: str
     first_row: int
@@ -47,28 +51,28 @@ class MappedTable:
     columns: tuple[MappedColumn, ...]
     number: str | None = None
     """Letters of the column with the modules' numbers or names. Without it, the first table's modules are 1, 2, ..."""
-    rows: Joined | None = None
-    """How the rows are matched with those of the first table: by the contents of the two `number` columns, in the same
+    rows: RowMatching | None = None
+    """Matching of the rows with those of the first table: by the contents of the two `number` columns, in the same
     order, or one row for all modules. None in the first table itself."""
     header_row: int | None = None
-    """For people."""
+    """Row of the headings, a note for people that is not read."""
     skip_rows: tuple[int, ...] = ()
     """Rows between the first and the last that do not belong to the table."""
 
     def row_numbers(self) -> tuple[int, ...]:
-        """The rows of the modules."""
+        """Return the rows of the modules, ascending."""
         skipped = set(self.skip_rows)
         return tuple(row for row in range(self.first_row, self.last_row + 1) if row not in skipped)
 
     def with_rows(self, rows: Sequence[int]) -> MappedTable:
-        """The table with other rows, which are in ascending order."""
+        """Return the table with other rows, given in ascending order."""
         skipped = sorted(set(range(rows[0], rows[-1])).difference(rows))
         return replace(self, first_row=rows[0], last_row=rows[-1], skip_rows=tuple(skipped))
 
 
 @dataclass(frozen=True)
 class ColumnMap:
-    """Which cells of a workbook hold which column of a scanner, given by a person instead of its headings.
+    """Map from cells of a workbook to columns of a scanner, given by a person instead of the workbook's headings.
 
     Of pinholes, the first of the `tables` holds x1, y1 and z1; d, R, Ld and Td must be in some table; without l, the design
     formula is used. A map read by `from_toml` or `read` may be incomplete: `faults` lists what is missing.
@@ -77,39 +81,39 @@ class ColumnMap:
     tables: tuple[MappedTable, ...]
 
     def faults(self, kind: str = "pinhole") -> list[str]:
-        """Why the map cannot be used for a kind of scanner, a line for each reason; empty if it is complete."""
-        declared = scanner_kind(kind).columns
-        first = declared.position or (declared.leading,)
+        """Return why the map cannot be used for a kind of scanner, a line for each reason; empty if it is complete."""
+        definitions = scanner_kind(kind).columns
+        leading = definitions.position or (definitions.leading,)
         if not self.tables:
-            return [f"the column map has no [[tables]], expected one with {', '.join(first)} first"]
-        faults = [fault for i, table in enumerate(self.tables) for fault in _table_faults(table, i, declared)]
-        places: dict[str, str] = {}
+            return [f"the column map has no [[tables]], expected one with {', '.join(leading)} first"]
+        faults = [fault for i, table in enumerate(self.tables) for fault in _find_table_faults(table, i, definitions)]
+        table_of: dict[str, str] = {}  # quantity -> name of the table that has it
         for i, table in enumerate(self.tables):
             for c in table.columns:
-                if c.quantity in places:
-                    faults.append(f"{_of(i, c.quantity)} is in {places[c.quantity]} too, expected each quantity once")
-                places.setdefault(c.quantity, _of(i))
-        for name in first:
-            if places.get(name) != _of(0):
-                found = f"{places[name]} has {name}" if name in places else f"{_of(0)} has no column {name}"
-                faults.append(f"{found}, expected {', '.join(first)} in the first table")
-        faults += [f"no table has a column {name}" for name in declared.needed if name not in {*places, *first}]
-        # A column may be used twice in the same rows only for the modules' numbers.
-        used: dict[tuple[str, str], list[tuple[set[int], str]]] = {}
+                if c.quantity in table_of:
+                    faults.append(f"{_key(i, c.quantity)} is in {table_of[c.quantity]} too, expected it in one table")
+                table_of.setdefault(c.quantity, _key(i))
+        for name in leading:
+            if table_of.get(name) != _key(0):
+                has = f"{table_of[name]} has {name}" if name in table_of else f"{_key(0)} has no column {name}"
+                faults.append(f"{has}, expected {', '.join(leading)} in the first table")
+        faults += [f"no table has a column {name}" for name in definitions.needed if name not in {*table_of, *leading}]
+        # Tables with common rows may share a column only if it has the modules' numbers.
+        uses_of_column: dict[tuple[str, str], list[tuple[set[int], str]]] = {}
         for i, table in enumerate(self.tables):
             rows = set(range(max(table.first_row, 1), min(table.last_row, MAX_ROW) + 1))
             names = [(c.quantity, c.column) for c in table.columns]
             names += [("number", table.number)] if table.number else []
             for name, column in names:
-                others = used.setdefault((table.sheet.casefold(), column), [])
-                for other_rows, other in others:
-                    if rows & other_rows and not (name == "number" and other.endswith(".number")):
-                        faults.append(f"{_of(i, name)}: column {column} is {other} too, expected another column")
-                others.append((rows, _of(i, name)))
+                uses = uses_of_column.setdefault((table.sheet.casefold(), column), [])
+                for used_rows, use in uses:
+                    if rows & used_rows and not (name == "number" and use.endswith(".number")):
+                        faults.append(f"{_key(i, name)}: column {column} is {use} too, expected another column")
+                uses.append((rows, _key(i, name)))
         return faults
 
     def to_toml(self) -> str:
-        """The map as text, which `from_toml` reads."""
+        """Return the map as TOML text, which `from_toml` reads."""
         lines = []
         for table in self.tables:
             lines.append("[[tables]]")
@@ -123,30 +127,34 @@ class ColumnMap:
 
     @classmethod
     def from_toml(cls, text: str, name: str = "column map") -> ColumnMap:
-        """The map in a TOML text; `InputError`, which calls it `name`, for unknown keys or values."""
-        return cls._of_values(parse_toml(text, name), name)
+        """Return the map in a TOML text, called `name` in messages; raise `InputError` for unknown keys or values."""
+        return cls._from_values(parse_toml(text, name), name)
 
     @classmethod
     def read(cls, path: AnyPath) -> ColumnMap:
-        """The map in a TOML file; `InputError` if it cannot be read."""
-        return cls._of_values(read_toml(path), str(path))
+        """Return the map in a TOML file; raise `InputError` if it cannot be read."""
+        return cls._from_values(read_toml(path), str(path))
 
     @classmethod
-    def _of_values(cls, values: dict[str, Any], name: str) -> ColumnMap:
-        _refuse_others(values, {"tables": list}, name)
+    def _from_values(cls, values: dict[str, Any], name: str) -> ColumnMap:
+        """Return the map with these parsed TOML values; `name` is its name in messages."""
+        _check_keys(values, {"tables": list}, name)
         tables = values.get("tables", [None])
         if not all(isinstance(table, dict) for table in tables):
             raise InputError(f"{name}: expected [[tables]] ({_HELP})")
-        return cls(tuple(_table(table, f"{name}: {_of(i)}") for i, table in enumerate(tables)))
+        return cls(tuple(_table_from_values(table, f"{name}: {_key(i)}") for i, table in enumerate(tables)))
 
     def write(self, path: AnyPath, comment: str = "") -> None:
-        """Write the map to a .toml file, below the lines of a comment."""
+        """Write the map to a .toml file, with the lines of `comment` as TOML comments above it."""
         lines = "".join(f"# {line}\n" for line in comment.splitlines())
         write_bytes(path, (lines + self.to_toml()).encode())
 
 
-def column_map(columns: ColumnMap | AnyPath | None, workbook: AnyPath, scanner: type[Scanner]) -> ColumnMap | None:
-    """The column map of `workbook` for a kind of scanner, given as such or by its file; `InputError` if incomplete."""
+def load_column_map(columns: ColumnMap | AnyPath | None, workbook: AnyPath, scanner: type[Scanner]) -> ColumnMap | None:
+    """Return the column map of `workbook` for a kind of scanner, from its file if `columns` is a path.
+
+    Returns None without `columns`; raises `InputError` for an incomplete map.
+    """
     if columns is None:
         return None
     name = str(columns)
@@ -159,48 +167,51 @@ def column_map(columns: ColumnMap | AnyPath | None, workbook: AnyPath, scanner: 
     return columns
 
 
-def _of(i: int, name: str = "") -> str:
+def _key(i: int, name: str = "") -> str:
+    """Return the name in messages of table `i`, counted from 0, or of a key or column in it, such as "table 2.d"."""
     return f"table {i + 1}" + (f".{name}" if name else "")
 
 
-def _table_faults(table: MappedTable, i: int, declared: ColumnTable) -> Iterator[str]:
+def _find_table_faults(table: MappedTable, i: int, definitions: ColumnTable) -> Iterator[str]:
+    """Yield a line for each reason why table `i` of a column map cannot be used."""
     if not 1 <= table.first_row <= table.last_row <= MAX_ROW:
-        yield f"{_of(i)}: rows {table.first_row} to {table.last_row}, expected the first row, then the last"
+        yield f"{_key(i)}: rows {table.first_row} to {table.last_row}, expected the first row, then the last"
     elif not table.row_numbers():
-        yield f"{_of(i)}: skip_rows leaves no row"
+        yield f"{_key(i)}: skip_rows leaves no row"
     for row in table.skip_rows:
         if not table.first_row < row < table.last_row:
-            yield f"{_of(i)}: skip_rows has {row}, expected rows between {table.first_row} and {table.last_row}"
+            yield f"{_key(i)}: skip_rows has {row}, expected rows between {table.first_row} and {table.last_row}"
     if not table.columns:
-        yield f"{_of(i)} has no columns"
+        yield f"{_key(i)} has no columns"
     for c in table.columns:
-        known = declared.get(c.quantity)
-        if known is None:
-            yield f"{_of(i, c.quantity)}: no such quantity, expected {', '.join(declared)}"
-        elif c.unit not in known.units:
-            yield f"{_of(i, c.quantity)}: unit {c.unit!r}, expected {', '.join(filter(None, known.units)) or 'none'}"
-        if not _is_column(c.column):
-            yield f"{_of(i, c.quantity)}: column {c.column!r}, expected letters such as B"
-    if table.number is not None and not _is_column(table.number):
-        yield f"{_of(i)}: number {table.number!r}, expected a column's letters such as A"
+        definition = definitions.get(c.quantity)
+        if definition is None:
+            yield f"{_key(i, c.quantity)}: no such quantity, expected {', '.join(definitions)}"
+        elif c.unit not in definition.units:
+            yield f"{_key(i, c.quantity)}: unit {c.unit!r}, expected {', '.join(filter(None, definition.units)) or 'none'}"
+        if not _is_column_letters(c.column):
+            yield f"{_key(i, c.quantity)}: column {c.column!r}, expected letters such as B"
+    if table.number is not None and not _is_column_letters(table.number):
+        yield f"{_key(i)}: number {table.number!r}, expected a column's letters such as A"
     if i == 0 and table.rows is not None:
-        yield f"{_of(0)} has rows = {table.rows!r}, which only the tables after the first may have"
-    if i > 0 and table.rows not in get_args(Joined):
-        yield f"{_of(i)}: rows = {table.rows!r}, expected {' or '.join(map(repr, get_args(Joined)))}"
+        yield f"{_key(0)} has rows = {table.rows!r}, which only the tables after the first may have"
+    if i > 0 and table.rows not in get_args(RowMatching):
+        yield f"{_key(i)}: rows = {table.rows!r}, expected {' or '.join(map(repr, get_args(RowMatching)))}"
     if i > 0 and table.rows == "by number" and table.number is None:
-        yield f"{_of(i)}: rows = 'by number' without number, expected the column of the numbers"
+        yield f"{_key(i)}: rows = 'by number' without number, expected the column of the numbers"
     if table.rows == "one for all" and len(table.row_numbers()) != 1:
-        yield f"{_of(i)}: rows = 'one for all' of several rows, expected first_row = last_row"
+        yield f"{_key(i)}: rows = 'one for all' of several rows, expected first_row = last_row"
 
 
-def _is_column(letters: str) -> bool:
+def _is_column_letters(letters: str) -> bool:
+    """Return whether a text is the letters of a column that a sheet can have."""
     from openpyxl.utils import column_index_from_string
 
     return bool(re.fullmatch("[A-Z]{1,3}", letters)) and column_index_from_string(letters) <= MAX_COLUMN
 
 
-def _refuse_others(values: dict[str, Any], kinds: dict[str, type], where: str) -> None:
-    """Raise `InputError` for keys and types of values that are not expected."""
+def _check_keys(values: dict[str, Any], kinds: dict[str, type], where: str) -> None:
+    """Raise `InputError` for a key that is not in `kinds`, or whose value is not of the type there; `where` is its place."""
     words = {int: "a whole number", str: "text in quotes", dict: "a table", list: "a list"}
     for key, value in values.items():
         if key not in kinds:
@@ -209,8 +220,9 @@ def _refuse_others(values: dict[str, Any], kinds: dict[str, type], where: str) -
             raise InputError(f"{where}: {key} = {value!r}, expected {words[kinds[key]]}")
 
 
-def _table(values: dict[str, Any], where: str) -> MappedTable:
-    _refuse_others(values, _KEYS, where)
+def _table_from_values(values: dict[str, Any], where: str) -> MappedTable:
+    """Return the table with these parsed TOML values; `where` names it in messages."""
+    _check_keys(values, _KEYS, where)
     if values.get("rows") == "one for all" and "first_row" in values:
         values = {"last_row": values["first_row"], **values}
     for key in ("sheet", "first_row", "last_row", "columns"):
@@ -222,7 +234,7 @@ def _table(values: dict[str, Any], where: str) -> MappedTable:
     columns = []
     for name, column in values["columns"].items():
         if isinstance(column, dict):
-            _refuse_others(column, {"column": str, "unit": str}, f"{where}.{name}")
+            _check_keys(column, {"column": str, "unit": str}, f"{where}.{name}")
         if not isinstance(column, dict) or len(column) < 2:
             raise InputError(f'{where}.{name}: expected {{ column = "B", unit = "mm" }}')
         columns.append(MappedColumn(name, column["column"].upper(), column["unit"]))

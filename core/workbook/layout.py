@@ -1,4 +1,4 @@
-"""Which cells hold which column of which module, whether the headings say so or a column map."""
+"""Layout of a scanner in a workbook: the cell of each module in each column, whether from the headings or a column map."""
 
 import itertools
 import math
@@ -11,128 +11,135 @@ import numpy as np
 from ..arrays import Array, Bools
 from ..errors import InputError, warn
 from ..geometry.columns import ColumnTable
-from .agreement import text_of
-from .book import HEADING_ROWS, Book, Sheet, module_number
-from .calculation import Uncomputed
-from .column_map import ColumnMap
-from .headings import shows_as_stored, vocabulary
+from .agreement import cell_text
+from .book import HEADING_ROWS, Book, Sheet, parse_module_number
+from .calculation import UncomputedValue
+from .column_map import ColumnMap, MappedTable
+from .headings import get_vocabulary, shows_as_stored
 
 MAX_MODULES = 10_000
 
 Label = int | str
-"""What a row calls its module: a number, or a name such as "M01"."""
+"""Number or name that a row gives its module, such as 7 or "M01"."""
 
 
-class Table:
-    """Rows of a sheet that hold modules; `columns` is name -> column of the sheet and unit, of those that are `declared`.
-
-    `heading_rows` are the first and the last row of its headings, `label_column` that of the modules' numbers or names.
-    """
+class ModuleTable:
+    """Table in a sheet with a row for each module, or one row for all modules."""
 
     sheet: Sheet
-    declared: ColumnTable
+    definitions: ColumnTable
+    """Columns of the scanner's kind."""
     columns: dict[str, tuple[int, str]]
+    """Name of the scanner's column -> column of the sheet, counted from 1, and unit of its numbers."""
     rows: tuple[int, ...]
+    """Rows of the modules, counted from 1."""
     heading_rows: tuple[int, ...]
+    """First and last row of the headings, one row if these are the same, none if a column map names no header row."""
     label_column: int | None
+    """Column of the modules' numbers or names, None without one."""
     labels: tuple[Label, ...] | None = None
-    """What the rows call their modules, once it is read."""
+    """Number or name of the module of each row, once `read_labels` was called."""
 
     def read_labels(self) -> None:
-        """Read what the rows call their modules; `InputError` if that does not tell them apart."""
+        """Read the modules' numbers or names; raise `InputError` if one is missing or occurs twice."""
         if self.label_column is not None:
-            self.labels = _labels(self.sheet, self.rows, self.label_column)
+            self.labels = _read_labels(self.sheet, self.rows, self.label_column)
 
     @cached_property
     def numbers(self) -> tuple[int, ...] | None:
-        """The modules' numbers, if the table has numbers."""
+        """Numbers of the modules, row by row; None if the table has names or neither."""
         labels = self.labels
         return None if labels is None or any(isinstance(x, str) for x in labels) else tuple(map(int, labels))
 
     @property
     def number_column(self) -> int | None:
-        """The column of the modules' numbers, if the table has numbers."""
+        """Column of the modules' numbers; None if the table has names or neither."""
         return None if self.numbers is None else self.label_column
 
     @cached_property
     def module_numbers(self) -> tuple[int, ...]:
-        """The table's numbers, else 1, 2, ..."""
+        """Numbers of the modules, row by row; 1, 2, ... if the table has none."""
         return self.numbers or tuple(range(1, len(self.rows) + 1))
 
 
 class ColumnCells:
-    """The cells of one column of the scanner; `factor` is their unit in mm or rad.
+    """Cells that hold the values of one column of the scanner.
 
-    `rows` has the row of each module of the table of `modules`, all the same if one cell holds for all (`shared`).
+    `modules` is the table with a row for each module, and `rows` has the row of each of its modules in `table`.
     """
 
-    def __init__(self, table: Table, name: str, modules: Table, rows: tuple[int, ...]) -> None:
+    def __init__(self, table: ModuleTable, name: str, modules: ModuleTable, rows: tuple[int, ...]) -> None:
         self.table, self.name, self.modules, self.rows = table, name, modules, rows
-        self.declared = table.declared[name]
+        self.definition = table.definitions[name]
+        """Definition of the scanner's column."""
         self.column, self.unit = table.columns[name]
-        self.factor = self.declared.units[self.unit]
+        self.factor = self.definition.units[self.unit]
+        """Value of the cells' unit in mm or rad."""
         self.shared = len(rows) > 1 and len(set(rows)) == 1
+        """Whether one cell holds for all modules."""
 
-    def where(self, i: int) -> str:
-        """File, sheet and cell of module index `i`."""
-        return self.table.sheet.where(self.rows[i], self.column)
+    def location(self, i: int) -> str:
+        """Return file, sheet and cell of the module with index `i`."""
+        return self.table.sheet.location(self.rows[i], self.column)
 
-    def place(self, i: int) -> str:
-        """Sheet and cell of module index `i`."""
-        return self.table.sheet.place(self.rows[i], self.column)
+    def address(self, i: int) -> str:
+        """Return sheet and cell of the module with index `i`."""
+        return self.table.sheet.address(self.rows[i], self.column)
 
-    def values(self, optional: bool = False, ignored: Bools | None = None) -> Array:
-        """What the cells hold (M,), numbers in their unit; `InputError` if one holds something else.
+    def read_values(self, optional: bool = False, ignored: Bools | None = None) -> Array:
+        """Return the contents of the cells (M,), numbers in the cells' unit; raise `InputError` for any other content.
 
-        NaN, or "" for a text, where they are `ignored`, or where a cell is blank, or its formula cannot be computed here but
-        by the package, if they are `optional`.
+        NaN, or "" in a column of texts, stands for a module that is `ignored` (M,). With `optional`, it also stands for a
+        blank cell, and for a formula that cannot be computed if the package can compute its value.
         """
-        absent = "" if self.declared.is_text else math.nan
-        found, sheet = [absent] * len(self.rows), self.table.sheet
+        absent = "" if self.definition.is_text else math.nan
+        values, sheet = [absent] * len(self.rows), self.table.sheet
         for i, row in enumerate(self.rows):
             if ignored is not None and ignored[i]:
                 continue
             value = sheet.value(row, self.column)
-            known = isinstance(value, Uncomputed) and bool(self.declared.derived or self.declared.formula)
-            if not (optional and (value is None or known)):
-                held = None if value is None or sheet.is_date(row, self.column) else self._held(value)
-                if held is None:
-                    of = "" if self.shared else f" of module {self.modules.module_numbers[i]}"
-                    seen = sheet.found(row, self.column)
-                    raise InputError(f"{self.where(i)} {seen}, expected {self.name}{of}, {self.declared.expected}")
-                found[i] = held
-        return np.array(found, np.str_ if self.declared.is_text else np.float64)
+            has_formula = bool(self.definition.derived or self.definition.formula)
+            is_computable = isinstance(value, UncomputedValue) and has_formula
+            if not (optional and (value is None or is_computable)):
+                usable = None if value is None or sheet.is_date(row, self.column) else self._usable_value(value)
+                if usable is None:
+                    module = "" if self.shared else f" of module {self.modules.module_numbers[i]}"
+                    expected = f"expected {self.name}{module}, {self.definition.expected}"
+                    raise InputError(f"{self.location(i)} {sheet.describe_content(row, self.column)}, {expected}")
+                values[i] = usable
+        return np.array(values, np.str_ if self.definition.is_text else np.float64)
 
-    def _held(self, value: Any) -> float | str | None:
-        """What a cell with this value holds, None if it is nothing for this column."""
-        if self.declared.is_text:
-            text = text_of(value)
-            return None if text is None or self.declared.parse(text) is None else text
+    def _usable_value(self, value: Any) -> float | str | None:
+        """Return a cell's value as the number or text that the column takes, None if it cannot be one."""
+        if self.definition.is_text:
+            text = cell_text(value)
+            return None if text is None or self.definition.parse(text) is None else text
         number = value if type(value) is float and math.isfinite(value) else None
-        return None if number is None or (self.declared.kind == "whole" and number % 1) else number
+        return None if number is None or (self.definition.kind == "whole" and number % 1) else number
 
-    def in_code(self, given: Array) -> Array:
-        """Numbers in the cells' unit as mm or rad, texts as the scanner has them."""
-        return np.array([self.declared.parse(text) for text in given]) if self.declared.is_text else given * self.factor
+    def to_scanner_units(self, values: Array) -> Array:
+        """Return numbers in the cells' unit as mm or rad, and texts as the words of the scanner's column."""
+        return np.array([*map(self.definition.parse, values)]) if self.definition.is_text else values * self.factor
 
-    def in_cells(self, values: Array) -> Array:
-        """Numbers in mm or rad in the cells' unit; texts as they are."""
-        return values if self.declared.is_text else values / self.factor
-
-
-def absent(given: Array) -> Bools:
-    """Where (M,) a column's cells hold nothing."""
-    return given == "" if given.dtype.kind == "U" else np.isnan(given)
+    def to_cell_units(self, values: Array) -> Array:
+        """Return numbers in mm or rad in the cells' unit; texts stay as they are."""
+        return values if self.definition.is_text else values / self.factor
 
 
-class Layout:
-    """Where a workbook's numbers are.
+def is_absent(cell_values: Array) -> Bools:
+    """Return for which modules (M,) a column's cells hold nothing: NaN, or "" in a column of texts."""
+    return cell_values == "" if cell_values.dtype.kind == "U" else np.isnan(cell_values)
 
-    `modules` is the table of x1, y1, z1; `rows_of` has the row of each module in every table with a row for each.
+
+class WorkbookLayout:
+    """Cells of all columns of a scanner in a workbook.
+
+    `modules` is the table with a row for each module; of pinholes, it is the table of x1, y1 and z1.
     """
 
-    def __init__(self, modules: Table) -> None:
-        sheet, rows, leading = modules.sheet, modules.rows, modules.declared.position or (modules.declared.leading,)
+    def __init__(self, modules: ModuleTable) -> None:
+        sheet, rows = modules.sheet, modules.rows
+        leading = modules.definitions.position or (modules.definitions.leading,)
         where = f"{sheet.book.path.name}: sheet {sheet.name} has"
         if not rows:
             raise InputError(f"{where} no modules, expected rows with {', '.join(leading)}")
@@ -140,20 +147,22 @@ class Layout:
             raise InputError(f"{where} {len(rows)} modules, expected at most {MAX_MODULES}")
         self.modules = modules
         self.columns: dict[str, ColumnCells] = {}
-        self.rows_of: dict[Table, tuple[int, ...]] = {modules: rows}
+        """Name of the scanner's column -> its cells."""
+        self.rows_of: dict[ModuleTable, tuple[int, ...]] = {modules: rows}
+        """Table with a row for each module -> the row of each module in it."""
 
-    def add(self, table: Table, name: str, rows: tuple[int, ...]) -> None:
-        """Take a column's cells from these rows of a table."""
+    def add_column(self, table: ModuleTable, name: str, rows: tuple[int, ...]) -> None:
+        """Enter the cells of the column `name` of the scanner: those of `table` in the modules' `rows`."""
         self.columns[name] = ColumnCells(table, name, self.modules, rows)
 
 
-class _MappedTable(Table):
-    """A table as a column map describes it."""
+class _ColumnMapTable(ModuleTable):
+    """Table in a sheet as a column map describes it."""
 
-    def __init__(self, book: Book, declared: ColumnTable, mapped: Any) -> None:
+    def __init__(self, book: Book, definitions: ColumnTable, mapped: MappedTable) -> None:
         from openpyxl.utils import column_index_from_string as index
 
-        self.sheet, self.declared = book.sheet(mapped.sheet, ", which the column map names"), declared
+        self.sheet, self.definitions = book.sheet(mapped.sheet, ", which the column map names"), definitions
         self.columns = {c.quantity: (index(c.column), c.unit) for c in mapped.columns}
         self.rows = mapped.row_numbers()
         self.heading_rows = (mapped.header_row,) if mapped.header_row else ()
@@ -161,88 +170,96 @@ class _MappedTable(Table):
         self.read_labels()
 
 
-def mapped_layout(book: Book, declared: ColumnTable, columns: ColumnMap) -> Layout:
-    """The layout that a complete column map describes."""
-    tables: list[Table] = []
-    for mapped in columns.tables:
-        tables.append(_MappedTable(book, declared, mapped))
-        for contradiction in itertools.islice(_contradictions(tables[-1]), 1):
+def mapped_layout(book: Book, definitions: ColumnTable, column_map: ColumnMap) -> WorkbookLayout:
+    """Return the layout that a complete column map describes."""
+    tables: list[ModuleTable] = []
+    for mapped in column_map.tables:
+        tables.append(_ColumnMapTable(book, definitions, mapped))
+        for contradiction in itertools.islice(_find_contradictions(tables[-1]), 1):
             warn(contradiction, 2)
-    modules, layout = tables[0], Layout(tables[0])
-    for table, mapped in zip(tables, columns.tables, strict=True):
+    modules, layout = tables[0], WorkbookLayout(tables[0])
+    for table, mapped in zip(tables, column_map.tables, strict=True):
         rows = modules.rows
         if mapped.rows == "one for all":
             rows = (table.rows[0],) * len(modules.rows)
         elif mapped.rows == "in order":
-            rows = layout.rows_of[table] = in_order(modules, table)
+            rows = layout.rows_of[table] = match_rows_in_order(modules, table)
         elif mapped.rows == "by number":
             if modules.labels is None:
                 matches = f"the column map matches the rows of sheet {mapped.sheet} by number"
-                found = "its first table has no number, expected the column of the modules' numbers there"
-                raise InputError(f"{book.path.name}: {matches}, but {found}")
-            rows = layout.rows_of[table] = by_label(modules, table)
+                problem = "its first table has no number, expected the column of the modules' numbers there"
+                raise InputError(f"{book.path.name}: {matches}, but {problem}")
+            rows = layout.rows_of[table] = match_rows_by_label(modules, table)
         for name in table.columns:
-            layout.add(table, name, rows)
+            layout.add_column(table, name, rows)
     return layout
 
 
-def _contradictions(table: Table) -> Iterator[str]:
-    """The headings and number formats of mapped columns that say another unit or column than the map."""
-    sheet, first, heading_of = table.sheet, table.rows[0], vocabulary(table.declared).heading_of
+def _find_contradictions(table: ModuleTable) -> Iterator[str]:
+    """Yield a message for each heading or number format that states another column or unit than the column map."""
+    sheet, first_row, vocabulary = table.sheet, table.rows[0], get_vocabulary(table.definitions)
     for name, (column, unit) in table.columns.items():
-        used = f"the column map says {name} in {unit}, which is used" if unit else f"the column map says {name}"
-        for row in range(max(1, first - HEADING_ROWS), first):
-            heading = heading_of(sheet.texts.get((row, column), ""))
+        map_says = f"the column map says {name} in {unit}, which is used" if unit else f"the column map says {name}"
+        for row in range(max(1, first_row - HEADING_ROWS), first_row):
+            heading = vocabulary.parse_heading(sheet.texts.get((row, column), ""))
             if heading is not None and (heading.name != name or heading.unit not in (None, unit)):
-                says = heading.name + (f" in {heading.unit}" if heading.unit else "")
-                yield f"{sheet.where(row, column)} says {says}, {used}"
-        shown = sheet.number_format(first, column)
-        if not table.declared[name].is_text and not shows_as_stored(shown, unit):
-            yield f"{sheet.where(first, column)} is shown as {shown!r}, {used}"
+                heading_says = heading.name + (f" in {heading.unit}" if heading.unit else "")
+                yield f"{sheet.location(row, column)} says {heading_says}, {map_says}"
+        number_format = sheet.number_format(first_row, column)
+        if not table.definitions[name].is_text and not shows_as_stored(number_format, unit):
+            yield f"{sheet.location(first_row, column)} is shown as {number_format!r}, {map_says}"
 
 
-def by_label(modules: Table, table: Table) -> tuple[int, ...]:
-    """The row of each module in `table`, by what both call it; a warning is given of modules only `table` has."""
-    assert modules.labels is not None and table.labels is not None, "asked only of tables with labels"
+def match_rows_by_label(modules: ModuleTable, table: ModuleTable) -> tuple[int, ...]:
+    """Return the row in `table` of each module of `modules`, found by the module's number or name.
+
+    Modules that only `table` has are left out, with a warning.
+    """
+    assert modules.labels is not None and table.labels is not None, "both tables have labels that were read"
     row_of = dict(zip(table.labels, table.rows, strict=True))
     for label, row in zip(modules.labels, modules.rows, strict=True):
         if label not in row_of:
-            where = modules.sheet.where(row, modules.label_column or 1)
+            location = modules.sheet.location(row, modules.label_column or 1)
             expected = f"a row for it in sheet {table.sheet.name} too, with its {', '.join(table.columns)}"
-            raise InputError(f"{where} is module {label}, expected {expected}")
+            raise InputError(f"{location} is module {label}, expected {expected}")
     extra = [label for label in table.labels if label not in set(modules.labels)]
     if extra:
-        more = f" and {len(extra) - 1} more modules" if len(extra) > 1 else ""
-        where = table.sheet.where(row_of[extra[0]], table.label_column or 1)
-        left = f"has module {extra[0]}{more} without coordinates in sheet {modules.sheet.name}"
-        warn(f"{where} {left}: left out", 2)
+        number = f" and {len(extra) - 1} more modules" if len(extra) > 1 else ""
+        location = table.sheet.location(row_of[extra[0]], table.label_column or 1)
+        problem = f"has module {extra[0]}{number} without coordinates in sheet {modules.sheet.name}"
+        warn(f"{location} {problem}: left out", 2)
     return tuple(row_of[label] for label in modules.labels)
 
 
-def in_order(modules: Table, table: Table) -> tuple[int, ...]:
-    """The row of each module in `table`, row by row."""
+def match_rows_in_order(modules: ModuleTable, table: ModuleTable) -> tuple[int, ...]:
+    """Return the row in `table` of each module of `modules`, matched in the order of the rows."""
     if len(table.rows) != len(modules.rows):
         name, (column, _) = next(iter(table.columns.items()))
         sheet, rows = table.sheet, table.rows
-        has = f"sheet {sheet.name} has {len(rows)} rows of {name}"
-        places = f"({sheet.place(rows[0], column)} to {sheet.place(rows[-1], column)})"
+        problem = f"sheet {sheet.name} has {len(rows)} rows of {name}"
+        cells = f"({sheet.address(rows[0], column)} to {sheet.address(rows[-1], column)})"
         expected = f"one or one for each of the {len(modules.rows)} modules of sheet {modules.sheet.name}"
-        raise InputError(f"{sheet.book.path.name}: {has} {places}, expected {expected}")
+        raise InputError(f"{sheet.book.path.name}: {problem} {cells}, expected {expected}")
     return table.rows
 
 
-def _labels(sheet: Sheet, rows: tuple[int, ...], column: int) -> tuple[Label, ...]:
+def _read_labels(sheet: Sheet, rows: tuple[int, ...], column: int) -> tuple[Label, ...]:
+    """Return the numbers in a column, or its texts if all cells hold texts and not all of these are numbers.
+
+    Raises `InputError` for a cell without a label and for a label that occurs twice.
+    """
     values = [sheet.value(row, column) for row in rows]
-    labels: list[Label | None] = [module_number(value) for value in values]
+    labels: list[Label | None] = [parse_module_number(value) for value in values]
     if all(type(value) is str for value in values) and None in labels:
         labels = [" ".join(str(value).split()) for value in values]
-    first: dict[Label, int] = {}
+    row_of: dict[Label, int] = {}
     for row, label in zip(rows, labels, strict=True):
-        where = sheet.where(row, column)
+        location = sheet.location(row, column)
         if label is None:
-            raise InputError(f"{where} {sheet.found(row, column)}, expected a module's number (or a name in every row)")
-        if label in first:
-            other = sheet.place(first[label], column)
-            raise InputError(f"{where} is module {label}, as is {other}: expected another number")
-        first[label] = row
-    return tuple(first)
+            content = sheet.describe_content(row, column)
+            raise InputError(f"{location} {content}, expected a module's number (or a name in every row)")
+        if label in row_of:
+            twin = sheet.address(row_of[label], column)
+            raise InputError(f"{location} is module {label}, as is {twin}: expected another number")
+        row_of[label] = row
+    return tuple(row_of)

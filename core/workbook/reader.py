@@ -1,4 +1,4 @@
-"""`read_system` and `read_scanner`: a geometry workbook as a scanner, and whether its numbers are possible and plausible."""
+"""Reader of geometry workbooks: `read_system` and `read_scanner`, with checks that numbers are possible and plausible."""
 
 import math
 from collections.abc import Iterator
@@ -17,127 +17,140 @@ from ..scanner_kinds import SCANNERS, scanner_kind
 from ..system_source import QuantityCells, SystemSource
 from .agreement import tolerance
 from .book import Book
-from .column_map import ColumnMap, column_map
-from .headed_table import headed_tables
-from .layout import ColumnCells, Layout, absent, mapped_layout
-from .recognition import recognized_layout
+from .column_map import ColumnMap, load_column_map
+from .headed_table import find_headed_tables
+from .layout import ColumnCells, WorkbookLayout, is_absent, mapped_layout
+from .recognition import headed_layout
 
-_SHOWN = 5
-"""Warnings of one column; the last one counts the rest."""
+_MAX_WARNINGS = 5
+"""Largest number of warnings about one column; the last one gives the number of all others."""
 
 
 def read_system(path: AnyPath, columns: ColumnMap | AnyPath | None = None) -> PinholeSystem:
-    """The pinhole scanner in a geometry workbook; `source` names the workbook and the cell of every number.
+    """Read the pinhole scanner in a geometry workbook; its `source` names the workbook and the cell of every number.
 
-    Tables are found by their headings, listed in `core.geometry.pinhole_columns`, with their units. What could be mistaken
-    is refused; `columns` then says what is meant. The pinhole centres, d, R, Ld and Td are needed, a number for each module
-    or one for all. l comes from its column, and where that is blank from `collimator_length`. Modules without tilt aim at
-    the isocentre. A stored value that is not what its formula gives is refused, unless all formulas store 0 or nothing.
-    Numbers that follow from the others are only checked: one that differs by more than 1e-6 (relative, mm or radians) and
-    by more than rounding in its last decimal is an `InputWarning`. So are columns that may be about the scanner and are not
-    understood.
+    Tables are found by their headings, listed in `core.geometry.pinhole_columns`, with their units. A workbook that could be
+    misunderstood is refused; `columns` can then say what is meant. The pinhole centres, d, R, Ld and Td are needed, a number
+    for each module or one for all. l comes from its column, and where that is blank from `collimator_length`. Modules
+    without tilt aim at the isocentre. A stored value that differs from the value of its formula is refused, unless all
+    formulas store 0 or nothing. Numbers that follow from other numbers are only checked: a number that differs by more than
+    1e-6 (relative, mm or radians) and by more than rounding in its last decimal gives an `InputWarning`. So does a column
+    that may be about the scanner and is not understood.
 
     Parameters
     ----------
     path
         An .xlsx or .xlsm file, which is only read; it may be open in Excel.
     columns
-        Which cells hold which column: a `ColumnMap`, or the path of one as TOML. Nothing else of the workbook is
-        then read. Default: by the headings.
+        The cells of each column: a `ColumnMap`, or the path of one as TOML. Nothing else of the workbook is then read.
+        Default: the cells under the headings.
 
     Raises
     ------
     InputError
-        Not a workbook, a heading, a note or a table that is not understood, or a cell that cannot be used: one
-        line with sheet and cell, what is there and what was expected.
+        The file is not a workbook, a heading, a note or a table is not understood, or a cell cannot be used. The message is
+        one line with sheet and cell, what is there and what was expected.
     """
     return _read(path, PinholeSystem, columns)
 
 
 def read_scanner(path: AnyPath, kind: str, columns: ColumnMap | AnyPath | None = None) -> Scanner:
-    """The scanner of a kind, such as "pinhole", in a geometry workbook that may hold others too; see `read_system`."""
+    """Read the scanner of a kind, such as "pinhole", in a geometry workbook that may hold others too; see `read_system`."""
     return _read(path, scanner_kind(kind), columns)
 
 
 def kinds_in(path: AnyPath) -> tuple[str, ...]:
-    """The kinds of scanners in a workbook: those whose own sheet it has, or whose headings are in its other sheets."""
+    """Return the kinds of the scanners in a workbook.
+
+    A kind with a sheet of its own is there if the workbook has that sheet, any other kind if its headings are in a sheet.
+    """
     book = Book(path)
-    own = {name: kind for name, kind in SCANNERS.items() if kind.sheet}
-    found = [name for name, kind in own.items() if book.workbook.title(kind.sheet)]
-    for name in SCANNERS.keys() - own.keys():
-        tables = headed_tables(book, SCANNERS[name])[1]
-        found += [name] if any(SCANNERS[name].columns.leading in table.columns for table in tables) else []
-    return tuple(name for name in SCANNERS if name in found)
+
+    def is_in_book(kind: type[Scanner]) -> bool:
+        """Return whether the workbook has the kind's sheet, or the heading of its leading column."""
+        if kind.sheet:
+            return book.workbook.find_title(kind.sheet) is not None
+        return any(kind.columns.leading in table.columns for table in find_headed_tables(book, kind)[1])
+
+    return tuple(name for name, kind in SCANNERS.items() if is_in_book(kind))
 
 
 def _read(path: AnyPath, scanner: type[AnyScanner], columns: ColumnMap | AnyPath | None) -> AnyScanner:
-    columns = column_map(columns, path, scanner)  # before the file, which may be large
-    return read(Book(path), scanner, columns).system
+    """Return the scanner of a class from the workbook file at `path`, by its headings or a column map."""
+    columns = load_column_map(columns, path, scanner)  # before the workbook, which may be large
+    return read_book(Book(path), scanner, columns).system
 
 
 @dataclass(frozen=True)
-class Reading(Generic[AnyScanner]):
-    """What is read from a workbook; `given` is what the cells hold, numbers in their units, NaN or "" for nothing."""
+class WorkbookReading(Generic[AnyScanner]):
+    """Scanner that was read from a workbook, with the cells that hold it."""
 
-    layout: Layout
-    given: dict[str, Array]
+    layout: WorkbookLayout
+    cell_values: dict[str, Array]
+    """Name of the scanner's column -> contents of its cells (M,), numbers in the cells' unit, NaN or "" for nothing."""
     system: AnyScanner
 
 
-def read(book: Book, scanner: type[AnyScanner], columns: ColumnMap | None = None) -> Reading[AnyScanner]:
-    """The scanner in `book` and where its numbers are; see `read_system`."""
-    declared = scanner.columns
-    layout = recognized_layout(book, scanner) if columns is None else mapped_layout(book, declared, columns)
+def read_book(book: Book, scanner: type[AnyScanner], columns: ColumnMap | None = None) -> WorkbookReading[AnyScanner]:
+    """Read the scanner in an open `book`, by its headings or a column map, as `read_system` does."""
+    definitions = scanner.columns
+    layout = headed_layout(book, scanner) if columns is None else mapped_layout(book, definitions, columns)
     cells = layout.columns
-    given = {name: cells[name].values() for name in declared.needed}
-    values = {name: cells[name].in_code(given[name]) for name in declared.needed}
-    for name in declared.dimensions:
+    cell_values = {name: cells[name].read_values() for name in definitions.needed}
+    values = {name: cells[name].to_scanner_units(cell_values[name]) for name in definitions.needed}
+    for name in definitions.dimensions:
         _refuse_not_positive(cells[name], values[name])
     numbers = layout.modules.module_numbers
-    for name, i, why in scanner.faults(values, numbers, lambda name, i: cells[name].place(i)):
-        raise InputError(f"{cells[name].where(i)} {why}")
-    defaults = {name: declared[name].default(values) for name in declared.optional}
+    for name, i, problem in scanner.faults(values, numbers, lambda name, i: cells[name].address(i)):
+        raise InputError(f"{cells[name].location(i)} {problem}")
+    defaults = {name: definitions[name].default(values) for name in definitions.optional}
     values |= defaults
-    for name in declared:  # causes before their effects
-        if name in cells and name in declared.derived:
-            given[name] = cells[name].values(True, declared[name].undefined(values))
-        elif name in cells and name in declared.optional:
-            given[name] = cells[name].values(columns is None or declared[name].is_text)
-            in_sheet = cells[name].in_code(given[name])
+    for name in definitions:  # causes before their effects
+        if name in cells and name in definitions.derived:
+            cell_values[name] = cells[name].read_values(True, definitions[name].undefined(values))
+        elif name in cells and name in definitions.optional:
+            cell_values[name] = cells[name].read_values(columns is None or definitions[name].is_text)
+            in_sheet = cells[name].to_scanner_units(cell_values[name])
             _refuse_not_positive(cells[name], in_sheet)
-            values[name] = np.where(absent(given[name]), defaults[name], in_sheet)
+            values[name] = np.where(is_absent(cell_values[name]), defaults[name], in_sheet)
     with naming(book.path.name):
-        system = scanner.from_values(values, np.array(numbers), _source(book, layout, columns))
-    for doubtful in _doubtful(book, cells, given, defaults, system):
-        warn(doubtful, 4)
-    return Reading(layout, given, system)
+        system = scanner.from_values(values, np.array(numbers), _system_source(book, layout, columns))
+    for doubt in _find_doubtful_values(book, cells, cell_values, defaults, system):
+        warn(doubt, 4)
+    return WorkbookReading(layout, cell_values, system)
 
 
-def _doubtful(
-    book: Book, cells: dict[str, ColumnCells], given: Values, defaults: Values, system: Scanner
+def _find_doubtful_values(
+    book: Book, cells: dict[str, ColumnCells], cell_values: Values, defaults: Values, system: Scanner
 ) -> Iterator[str]:
-    """What is read but may be wrong, as texts of warnings; `defaults` are the values of blank cells, mm."""
-    declared = system.columns
-    for name in declared.optional:
-        if name in given and declared[name].formula:
-            yield from _differences(cells[name], given[name], defaults[name], "sheet")
-    yield from _implausible(system, cells)
-    for name in declared.derived:
-        if name in given:
-            rounded = declared[name].rounded_with
-            slack = _rounding(cells[rounded], declared[rounded].values(system)) if rounded in cells else 0.0
-            yield from _differences(cells[name], given[name], declared[name].values(system), "formula", slack)
-    for place, why in list(book.unverified.items())[:1]:
+    """Yield a warning for each value that was read and may be wrong.
+
+    `cell_values` are the contents of the cells, numbers in their unit; `defaults` the values of blank cells, mm or rad.
+    """
+    definitions = system.columns
+    for name in definitions.optional:
+        if name in cell_values and definitions[name].formula:
+            yield from _find_differences(cells[name], cell_values[name], defaults[name], "sheet")
+    yield from _find_implausible_values(system, cells)
+    for name in definitions.derived:
+        if name in cell_values:
+            rounded = definitions[name].rounded_with
+            slack = _rounding_errors(cells[rounded], definitions[rounded].values(system)) if rounded in cells else 0.0
+            expected = definitions[name].values(system)
+            yield from _find_differences(cells[name], cell_values[name], expected, "formula", slack)
+    for address, reason in list(book.unverified.items())[:1]:
         though = "the file asks to be calculated when it is opened and the formula cannot be computed here"
-        yield f"{book.path.name}: {book.workbook.text(place)}: the stored value is used, though {though} ({why})"
+        cell = f"{book.path.name}: {book.workbook.address_text(address)}"
+        yield f"{cell}: the stored value is used, though {though} ({reason})"
 
 
-def _rounding(column: ColumnCells, values: Floats) -> Floats:
-    """By how much (M,) the numbers in a column's cells may be rounded, mm or rad."""
+def _rounding_errors(column: ColumnCells, values: Floats) -> Floats:
+    """Return the largest rounding error (M,) of the numbers `values` (M,) in a column's cells, all in mm or rad."""
     return column.factor * np.array([tolerance(x, x, column.unit) for x in values / column.factor])
 
 
-def _source(book: Book, layout: Layout, columns: ColumnMap | None) -> SystemSource:
+def _system_source(book: Book, layout: WorkbookLayout, column_map: ColumnMap | None) -> SystemSource:
+    """Return the record of the workbook and of the cells that a scanner is read from."""
     from openpyxl.utils import get_column_letter
 
     modules = layout.modules
@@ -148,52 +161,54 @@ def _source(book: Book, layout: Layout, columns: ColumnMap | None) -> SystemSour
     if modules.number_column is not None:
         letters = get_column_letter(modules.number_column)
         cells.insert(0, QuantityCells("number", modules.sheet.name, letters, modules.rows))
-    dimension = (*modules.declared.dimensions, modules.declared.leading)[0]
+    dimension = (*modules.definitions.dimensions, modules.definitions.leading)[0]
     coordinates, dimensions = modules.sheet.name, layout.columns[dimension].table.sheet.name
     path, numbers = book.path.absolute(), modules.module_numbers
-    return SystemSource(path, book.sha256, coordinates, dimensions, numbers, tuple(cells), columns)
+    return SystemSource(path, book.sha256, coordinates, dimensions, numbers, tuple(cells), column_map)
 
 
 def _refuse_not_positive(column: ColumnCells, values: Floats) -> None:
-    """Raise `InputError` if a number (M,), mm or rad, is not positive but plausible ones are."""
-    declared = column.declared
-    for i in first_true(values <= 0) if declared.plausible[0] > 0 else ():
-        raise InputError(f"{column.where(i)} has {declared.name} = {declared.text_of(values[i])}, expected more than 0")
+    """Raise `InputError` if a number (M,), mm or rad, is not positive in a column whose plausible values all are."""
+    for i in first_true(values <= 0) if column.definition.plausible[0] > 0 else ():
+        has = f"has {column.name} = {column.definition.text_of(values[i])}"
+        raise InputError(f"{column.location(i)} {has}, expected more than 0")
 
 
-def _implausible(system: Scanner, cells: dict[str, ColumnCells]) -> Iterator[str]:
-    """For each column, the first module whose number is unlike that of any scanner."""
-    for name, declared in system.columns.items():
-        if declared.is_text:
+def _find_implausible_values(system: Scanner, cells: dict[str, ColumnCells]) -> Iterator[str]:
+    """Yield for each column a warning about the first module whose number is outside the plausible limits."""
+    for name, definition in system.columns.items():
+        if definition.is_text:
             continue
-        low, high = declared.plausible
-        values = declared.values(system)
-        column = cells[name if name in cells and not declared.derived else system.columns.leading]
-        odd = np.flatnonzero((values < low) | (values > high))
-        if len(odd):
-            several = len(set(column.rows)) > 1 and len(odd) > 1
-            more = f" (so it is for {len(odd) - 1} more modules)" if several else ""
-            limits = f"{low / next(iter(declared.units.values())):g} to {declared.text_of(high)}"
-            makes = f"makes {name} = {declared.text_of(values[odd[0]])}{more}"
-            yield f"{column.where(int(odd[0]))} {makes}, which is unlikely, expected {limits}: are the units right?"
+        low, high = definition.plausible
+        values = definition.values(system)
+        column = cells[name if name in cells and not definition.derived else system.columns.leading]
+        implausible = np.flatnonzero((values < low) | (values > high)).tolist()
+        for i in implausible[:1]:
+            are_several = len(set(column.rows)) > 1 and len(implausible) > 1
+            repeated = f" (so it is for {len(implausible) - 1} more modules)" if are_several else ""
+            limits = f"{low / next(iter(definition.units.values())):g} to {definition.text_of(high)}"
+            makes = f"makes {name} = {definition.text_of(values[i])}{repeated}"
+            yield f"{column.location(i)} {makes}, which is unlikely, expected {limits}: are the units right?"
 
 
-def _differences(
-    column: ColumnCells, given: Floats, expected: Floats, used: str, slack: Floats | float = 0.0
+def _find_differences(
+    column: ColumnCells, cell_values: Floats, expected: Floats, used: str, slack: Floats | float = 0.0
 ) -> Iterator[str]:
-    """The first modules whose number `given` (M,) in the sheet, in its unit, is not as `expected` (M,), mm or rad.
+    """Yield warnings about the first modules whose number in the sheet is not the expected one.
 
-    The tolerance is larger by `slack`, mm, for rounding of the numbers behind `expected`. `used` says whose is taken.
+    `cell_values` (M,) are in the cells' unit, `expected` (M,) in mm or rad. The tolerance is larger by `slack`, mm or rad,
+    for rounding of the numbers behind `expected`. `used` names the source of the number that is taken: sheet or formula.
     """
     name, unit = column.name, column.unit
-    expected, slack = expected / column.factor, np.broadcast_to(slack, given.shape) / column.factor
-    difference = np.abs(given - expected)
-    if column.declared.kind == "angle":
+    expected, slack = expected / column.factor, np.broadcast_to(slack, cell_values.shape) / column.factor
+    difference = np.abs(cell_values - expected)
+    if column.definition.kind == "angle":
         turn = 2 * math.pi / column.factor
-        difference = np.abs((given - expected + turn / 2) % turn - turn / 2)
-    filled = np.flatnonzero(np.isfinite(given)).tolist()
-    differing = [i for i in filled if difference[i] > tolerance(given[i], expected[i], unit) + slack[i]]
-    for n, i in enumerate(differing[:_SHOWN], start=1):
-        more = f"; so do {len(differing) - _SHOWN} more cells of this column" if n == _SHOWN < len(differing) else ""
-        both = f"has {name} = {given[i]:.9g} {unit}, the formula gives {expected[i]:.9g} {unit}"
-        yield f"{column.where(i)} {both} (the {used}'s is used{more})"
+        difference = np.abs((cell_values - expected + turn / 2) % turn - turn / 2)
+    filled = np.flatnonzero(np.isfinite(cell_values)).tolist()
+    differing = [i for i in filled if difference[i] > tolerance(cell_values[i], expected[i], unit) + slack[i]]
+    for n, i in enumerate(differing[:_MAX_WARNINGS], start=1):
+        is_cut = n == _MAX_WARNINGS < len(differing)
+        rest = f"; so do {len(differing) - _MAX_WARNINGS} more cells of this column" if is_cut else ""
+        both = f"has {name} = {cell_values[i]:.9g} {unit}, the formula gives {expected[i]:.9g} {unit}"
+        yield f"{column.location(i)} {both} (the {used}'s is used{rest})"

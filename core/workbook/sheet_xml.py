@@ -1,4 +1,4 @@
-"""The cells of a worksheet's XML, which can be changed; writing replaces only the bytes of changed cells."""
+"""Cells of a worksheet's XML part, read and changed; writing replaces only the bytes of changed cells."""
 
 from __future__ import annotations
 
@@ -9,34 +9,34 @@ from functools import lru_cache
 from typing import Any, NamedTuple
 
 from ..errors import InputError
-from .package import Element, elements, escaped, spliced, with_attribute
+from .package import Element, escape_xml, parse_elements, set_attribute, splice
 
 MAIN = "http://schemas.openxmlformats.org/spreadsheetml/2006/main"
 STRICT = "http://purl.oclc.org/ooxml/spreadsheetml/main"
 
-MAX_ROW = 1_048_576
-MAX_COLUMN = 16_384
-At = tuple[int, int]
-"""Row and column, counted from 1."""
+MAX_ROW, MAX_COLUMN = 1_048_576, 16_384
+Position = tuple[int, int]
+"""Row and column of a cell, counted from 1."""
 
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
 
 _SHEET = re.compile(r"'((?:[^'\[\]]|'')+)'|[^'!\[\]()\s]+")
-"""A sheet's name in a formula; that of another file has brackets."""
+"""Name of a sheet in a formula; a sheet of another file has brackets, which do not match."""
 
 
 class CellError(str):
-    """An error value such as #REF! or #DIV/0!."""
+    """Error value of a cell, such as #REF! or #DIV/0!."""
 
 
-class Unreadable(str):
-    """The text of a stored value that is neither number, text, boolean nor error."""
+class UnreadableValue(str):
+    """Text of a stored value that is neither number, text, boolean nor error."""
 
 
 class Reference(NamedTuple):
-    """An area of cells; ``sheet`` is None for the formula's own, "First:Last" for an area through several sheets."""
+    """Area of cells that a formula refers to."""
 
     sheet: str | None
+    """Name of the sheet; None for the formula's own sheet, "First:Last" for an area through several sheets."""
     top: int
     left: int
     bottom: int
@@ -44,40 +44,43 @@ class Reference(NamedTuple):
 
     @property
     def name(self) -> str:
-        """E.g. ``B3:C5``."""
+        """Name of the area without its sheet, such as ``B3:C5``."""
         return f"{cell_name((self.top, self.left))}:{cell_name((self.bottom, self.right))}"
 
     @property
     def size(self) -> int:
-        """How many cells it has."""
+        """Number of cells in the area."""
         return (self.bottom - self.top + 1) * (self.right - self.left + 1)
 
     def contains(self, row: int, column: int) -> bool:
-        """Whether a cell is in the area, whatever its sheet."""
+        """Return whether a cell lies in the area; the sheet is not compared."""
         return self.top <= row <= self.bottom and self.left <= column <= self.right
 
 
-def cell_name(at: At) -> str:
-    """E.g. ``B3``."""
+def cell_name(position: Position) -> str:
+    """Return the name of the cell at (row, column), such as ``B3``."""
     from openpyxl.utils import get_column_letter
 
-    return f"{get_column_letter(at[1])}{at[0]}"
+    return f"{get_column_letter(position[1])}{position[0]}"
 
 
 @lru_cache(maxsize=2**15)
-def reference(text: str) -> Reference | None:
-    """What ``B3``, ``'My sheet'!$B$3:$B$82``, ``A:C`` or ``3:5`` refers to; None for a name or another file's cell."""
+def parse_reference(text: str) -> Reference | None:
+    """Return the area of a reference such as ``B3``, ``'My sheet'!$B$3:$B$82``, ``A:C`` or ``3:5``.
+
+    Returns None for a defined name and for a cell of another file.
+    """
     from openpyxl.utils import range_boundaries
 
-    before, of_sheet, cells = text.rpartition("!")
-    named = _SHEET.fullmatch(before)
+    sheet_text, separator, cells = text.rpartition("!")
+    sheet_match = _SHEET.fullmatch(sheet_text)
     try:
         left, top, right, bottom = range_boundaries(cells)
     except ValueError:
         return None
-    if (of_sheet and named is None) or (":" not in cells and None in (left, top)):
+    if (separator and sheet_match is None) or (":" not in cells and None in (left, top)):
         return None
-    sheet = named[1].replace("''", "'") if named and named[1] else before or None
+    sheet = sheet_match[1].replace("''", "'") if sheet_match and sheet_match[1] else sheet_text or None
     columns = sorted([left or 1, right or MAX_COLUMN])
     rows = sorted([1 if top is None else top, MAX_ROW if bottom is None else bottom])
     if rows[0] < 1 or rows[1] > MAX_ROW or columns[1] > MAX_COLUMN:
@@ -86,30 +89,35 @@ def reference(text: str) -> Reference | None:
 
 
 @dataclass(frozen=True)
-class _Origin:
-    """The XML that a cell was read from; `group` is the index of its shared formula."""
+class _CellOrigin:
+    """Cell as it was read from the file, with the XML that is kept where it does not change."""
 
-    at: At
+    position: Position
     element: Element
+    """The cell's element."""
     formula: Element | None
+    """Element of the formula inside the cell's element."""
     text: str | None
+    """Formula with its "=", or None; a shared formula is translated to this cell."""
     value: Any
-    group: str | None
+    shared_index: str | None
+    """Index of the shared formula that the cell belongs to, None for any other cell."""
 
 
 @dataclass(frozen=True)
 class Cell:
-    """The content of a cell."""
+    """Content of a cell."""
 
     value: Any = None
-    """The typed value, or the stored result of the formula: a float, str, bool, `CellError`, `Unreadable` or None."""
+    """The typed value, or the stored result of the formula: a float, str, bool, `CellError`, `UnreadableValue` or None."""
     formula: str | None = None
-    """With its "="; a shared formula as it reads in this cell."""
+    """Formula with its "="; a shared formula is translated to this cell."""
     array: Reference | None = None
-    """The area of the array formula or data table that the cell belongs to, if that has several cells."""
-    single_array: bool = False
+    """Area of the array formula or data table that the cell belongs to, if that covers several cells."""
+    is_single_array: bool = False
     """Whether the formula is an array formula of this cell alone."""
-    origin: _Origin | None = field(default=None, compare=False, repr=False)
+    origin: _CellOrigin | None = field(default=None, compare=False, repr=False)
+    """The cell in the file that this content comes from, None for a new cell."""
 
     @property
     def blank(self) -> bool:
@@ -118,36 +126,37 @@ class Cell:
 
     @property
     def style(self) -> str | None:
-        """The number of its style, None for the default."""
+        """Number of the cell's style, None for the default style."""
         return self.origin.element.attributes.get("s") if self.origin else None
 
-    def typed(self, value: float | str | None) -> Cell:
-        """The cell with a number or a text, or nothing, instead of its content."""
-        return replace(self, value=None if value == "" else value, formula=None, single_array=False)
+    def with_value(self, value: float | str | None) -> Cell:
+        """Return the cell with a number, a text or nothing in place of its content."""
+        return replace(self, value=None if value == "" else value, formula=None, is_single_array=False)
 
 
 _BLANK = Cell()
 
 
 class SheetXml:
-    """The cells of a worksheet part, with the workbook's shared `strings`; messages name the `file` and the sheet.
+    """Cells of a worksheet part, to be changed and written back.
 
-    `cells` has the `Cell` at each (row, column), to be changed before `to_bytes`, `original` those as read, and `merged`
-    the merged areas.
+    `data` is the XML, `strings` are the workbook's shared strings; messages name the `file` and the sheet's `name`.
     """
 
     def __init__(self, data: bytes, strings: list[str], name: str, file: str) -> None:
         self.name, self._file, self._data = name, file, data
         self._rows: dict[int, Element] = {}
-        self._in_row: dict[int, list[tuple[int, Element]]] = defaultdict(list)
+        self._cells_in_row: dict[int, list[tuple[int, Element]]] = defaultdict(list)
         self._sheet_data: Element  # every sheet with cells has one
         self._prefix = b""
         self._dimension: Element | None = None
-        self.cells: dict[At, Cell] = {}
-        self.merged: list[Reference] = []
-        masters: dict[str, tuple[At, str]] = {}  # of shared formulas
+        self.cells: dict[Position, Cell] = {}
+        """Position -> content of the cell, changed or not."""
+        self.merged_areas: list[Reference] = []
+        self._shared_formulas: dict[str, tuple[Position, str]] = {}
+        """Index of a shared formula -> position of the cell that holds its text, and the text."""
         row = column = 0
-        for e in elements(data, f"{file}: sheet {name}"):
+        for e in parse_elements(data, f"{file}: sheet {name}"):
             if e.namespace != MAIN:
                 continue
             parent = e.parent.name if e.parent is not None else ""
@@ -155,233 +164,246 @@ class SheetXml:
                 row, column = int(e.attributes.get("r", row + 1)), 0
                 self._rows.setdefault(row, e)
             elif e.name == "c" and parent == "row":
-                named = reference(e.attributes["r"]) if "r" in e.attributes else None
-                # As in spreadsheet programs, a cell's own name counts, whatever row it is in.
-                at = (named.top, named.left) if named else (row, column + 1)
-                column = at[1]
-                self._in_row[row].append((column, e))
-                self._read_cell(at, e, strings, masters)
+                address = parse_reference(e.attributes["r"]) if "r" in e.attributes else None
+                # As in spreadsheet programs, a cell's address decides, whatever row element it is in.
+                position = (address.top, address.left) if address else (row, column + 1)
+                column = position[1]
+                self._cells_in_row[row].append((column, e))
+                self._read_cell(position, e, strings)
             elif e.name == "sheetData":
                 self._sheet_data = e
                 self._prefix = data[e.start + 1 : e.inner].split(b"sheetData", 1)[0]
             elif e.name == "dimension":
                 self._dimension = e
-            elif e.name == "mergeCell" and (area := reference(e.attributes.get("ref", ""))) is not None:
-                self.merged.append(area)
+            elif e.name == "mergeCell" and (area := parse_reference(e.attributes.get("ref", ""))) is not None:
+                self.merged_areas.append(area)
         self._mark_arrays()
         self.original = dict(self.cells)
+        """Position -> content of the cell in the file."""
 
-    def _read_cell(self, at: At, element: Element, strings: list[str], masters: dict[str, tuple[At, str]]) -> None:
-        parts = {e.name: e for e in element.children if e.namespace == MAIN}
-        if at in self.cells:
-            twice = f"{self.name}!{cell_name(at)} is stored twice in the file"
-            raise InputError(f"{self._file}: {twice}, expected it once; Excel or LibreOffice may repair it")
-        if len(parts) < sum(e.namespace == MAIN for e in element.children):
-            raise InputError(f"{self._file}: {self.name}!{cell_name(at)} has several values in the file, expected one")
-        value = _value(element.attributes.get("t", "n"), parts, strings)
-        formula, group, text = parts.get("f"), None, None
+    def _read_cell(self, position: Position, element: Element, strings: list[str]) -> None:
+        """Add the cell at a position from its element; `strings` are the workbook's shared strings."""
+        children = {e.name: e for e in element.children if e.namespace == MAIN}
+        if position in self.cells:
+            problem = f"{self.name}!{cell_name(position)} is stored twice in the file"
+            raise InputError(f"{self._file}: {problem}, expected it once; Excel or LibreOffice may repair it")
+        if len(children) < sum(e.namespace == MAIN for e in element.children):
+            raise InputError(f"{self._file}: {self.name}!{cell_name(position)} stores several values, expected one")
+        value = _read_value(element.attributes.get("t", "n"), children, strings)
+        formula, shared_index, text = children.get("f"), None, None
         if formula is not None:
             text = f"={formula.text.strip()}" if formula.text.strip() else None
             if formula.attributes.get("t") == "shared":
-                group = formula.attributes.get("si", "")
+                shared_index = formula.attributes.get("si", "")
                 if text is not None:
-                    masters[group] = at, text
-                elif group in masters:
-                    start, text = masters[group]
-                    text = moved(text, start, at)
-        self.cells[at] = Cell(value, text, origin=_Origin(at, element, formula, text, value, group))
+                    self._shared_formulas[shared_index] = position, text
+                elif shared_index in self._shared_formulas:
+                    start, text = self._shared_formulas[shared_index]
+                    text = translate_formula(text, start, position)
+        origin = _CellOrigin(position, element, formula, text, value, shared_index)
+        self.cells[position] = Cell(value, text, origin=origin)
 
     def _mark_arrays(self) -> None:
-        for at, cell in list(self.cells.items()):
-            f = cell.origin.formula if cell.origin else None
-            if f is None or f.attributes.get("t") not in ("array", "dataTable"):
+        """Set `array` or `is_single_array` of the cells that belong to array formulas and data tables."""
+        for position, cell in list(self.cells.items()):
+            formula = cell.origin.formula if cell.origin else None
+            if formula is None or formula.attributes.get("t") not in ("array", "dataTable"):
                 continue
-            area = reference(f.attributes.get("ref", ""))
+            area = parse_reference(formula.attributes.get("ref", ""))
             if area is None or (area.top, area.left) == (area.bottom, area.right):
-                self.cells[at] = replace(cell, single_array=f.attributes["t"] == "array")
+                self.cells[position] = replace(cell, is_single_array=formula.attributes["t"] == "array")
                 continue
-            for place in self.cells:
-                if place == at or area.contains(*place):
-                    self.cells[place] = replace(self.cells[place], array=area)
+            for member in self.cells:
+                if member == position or area.contains(*member):
+                    self.cells[member] = replace(self.cells[member], array=area)
 
-    def cell(self, at: At) -> Cell:
-        """The cell, a blank one if the sheet has none there."""
-        return self.cells.get(at, _BLANK)
+    def cell(self, position: Position) -> Cell:
+        """Return the cell at a position, a blank one if the sheet has none there."""
+        return self.cells.get(position, _BLANK)
 
-    def type(self, at: At, value: float | str | None) -> None:
-        """Put a number or a text, or nothing, into a cell."""
-        self.refuse_array(at)
-        self.cells[at] = self.cell(at).typed(value)
+    def set_value(self, position: Position, value: float | str | None) -> None:
+        """Put a number or a text into a cell, or nothing, in place of its content."""
+        self.refuse_array(position)
+        self.cells[position] = self.cell(position).with_value(value)
 
-    def copy(self, cell: Cell, start: At, to: At) -> None:
-        """Put `cell`, which stood at `start`, at `to`; the relative references of its formula move along."""
+    def copy_cell(self, cell: Cell, start: Position, target: Position) -> None:
+        """Put `cell`, which stood at `start`, at `target`; the relative references of its formula move along."""
         self.refuse_array(start)
-        self.refuse_array(to)
-        self.cells[to] = replace(cell, formula=moved(cell.formula, start, to))
+        self.refuse_array(target)
+        self.cells[target] = replace(cell, formula=translate_formula(cell.formula, start, target))
 
-    def refuse_array(self, at: At) -> None:
+    def refuse_array(self, position: Position) -> None:
         """Raise `InputError` for a cell of an array formula of several cells: these change only together."""
-        area = self.cell(at).array
+        area = self.cell(position).array
         if area is not None:
-            found = f"{self.name}!{cell_name(at)} is one cell of the array formula or data table {area.name}"
-            raise InputError(f"{self._file}: {found}, expected a cell of its own: its number cannot be changed alone")
+            problem = f"{self.name}!{cell_name(position)} is one cell of the array formula or data table {area.name}"
+            raise InputError(f"{self._file}: {problem}, expected a cell of its own: its number cannot be changed alone")
 
     @property
-    def changed(self) -> list[At]:
-        """The cells that are not as read, row by row."""
-        return sorted(at for at, cell in self.cells.items() if not _same(cell, self._was(at)))
+    def changed_positions(self) -> list[Position]:
+        """Positions of the cells that differ from the file, row by row."""
+        return sorted(p for p, cell in self.cells.items() if not _is_unchanged(cell, self._original(p)))
 
     @property
     def formulas_added_or_removed(self) -> bool:
-        """Whether other cells have formulas than when read."""
-        return any((self.cells[at].formula is None) != (self._was(at).formula is None) for at in self.changed)
+        """Whether a cell has a formula now and none in the file, or the reverse."""
+        pairs = ((self.cells[p].formula, self._original(p).formula) for p in self.changed_positions)
+        return any((formula is None) != (original is None) for formula, original in pairs)
 
-    def _was(self, at: At) -> Cell:
-        return self.original.get(at, _BLANK)
+    def _original(self, position: Position) -> Cell:
+        """Return the content of a cell in the file, a blank one if the file has none there."""
+        return self.original.get(position, _BLANK)
 
     def to_bytes(self) -> bytes:
-        """The part with the changed cells."""
-        changed = self.changed
-        split = {group for at in changed if (group := self._group_without_text(at)) is not None}
-        members = [at for at, cell in self.cells.items() if cell.origin and cell.origin.group in split]
+        """Return the XML of the worksheet with the changed cells."""
+        changed = self.changed_positions
+        # The cells of a shared formula need formulas of their own when the cell that holds its text changes.
+        split = {index for position in changed if (index := self._lost_shared_index(position)) is not None}
+        members = [p for p, cell in self.cells.items() if cell.origin and cell.origin.shared_index in split]
         changes: list[tuple[int, int, bytes]] = []
         added: dict[int, list[tuple[int, bytes]]] = defaultdict(list)
-        for at in sorted({*changed, *members}):
-            xml, old = self._xml(at, split), self._was(at).origin
-            if old is None:
-                added[at[0]].append((at[1], xml))
+        for position in sorted({*changed, *members}):
+            xml, origin = self._cell_xml(position, split), self._original(position).origin
+            if origin is None:
+                added[position[0]].append((position[1], xml))
             else:
-                changes.append((old.element.start, old.element.end, xml))
+                changes.append((origin.element.start, origin.element.end, xml))
         for row, cells in added.items():
-            changes += self._into_row(self._rows[row], row, cells) if row in self._rows else [self._new_row(row, cells)]
-        area = None if self._dimension is None else reference(self._dimension.attributes.get("ref", ""))
+            changes += self._fill_row(self._rows[row], row, cells) if row in self._rows else [self._new_row(row, cells)]
+        area = None if self._dimension is None else parse_reference(self._dimension.attributes.get("ref", ""))
         if added and self._dimension is not None and area is not None:
             e, columns = self._dimension, [column for cells in added.values() for column, _ in cells]
             top, left = min(area.top, *added), min(area.left, *columns)
-            grown = Reference(None, top, left, max(area.bottom, *added), max(area.right, *columns))
-            changes.append((e.start, e.inner, with_attribute(self._data[e.start : e.inner], "ref", grown.name)))
-        return spliced(self._data, changes)
+            enlarged = Reference(None, top, left, max(area.bottom, *added), max(area.right, *columns))
+            changes.append((e.start, e.inner, set_attribute(self._data[e.start : e.inner], "ref", enlarged.name)))
+        return splice(self._data, changes)
 
-    def _group_without_text(self, at: At) -> str | None:
-        """The shared formula whose text the cell held and holds no longer."""
-        was, cell = self._was(at), self.cells[at]
-        if was.origin is None or was.origin.formula is None or not was.origin.formula.text.strip():
+    def _lost_shared_index(self, position: Position) -> str | None:
+        """Return the index of the shared formula whose text the cell held in the file and holds no longer, else None."""
+        original, cell = self._original(position), self.cells[position]
+        if (origin := original.origin) is None or origin.formula is None or not origin.formula.text.strip():
             return None
-        return None if cell.formula == was.formula and cell.origin is was.origin else was.origin.group
+        return None if cell.formula == original.formula and cell.origin is origin else origin.shared_index
 
-    def _xml(self, at: At, split: set[str]) -> bytes:
-        """A cell's element; shared formulas of the groups in `split` become formulas of their own."""
-        cell = self.cells[at]
+    def _cell_xml(self, position: Position, split: set[str]) -> bytes:
+        """Return the XML of a cell; shared formulas with an index in `split` are written out as formulas of the cell."""
+        cell = self.cells[position]
         origin, data, prefix = cell.origin, self._data, self._prefix
         tag = b"<%bc>" % prefix if origin is None else self._start_tag(origin.element)
-        value_kept = origin is not None and cell.value is origin.value
-        if origin is None or origin.at != at:
-            tag = with_attribute(tag, "r", cell_name(at))
-        if not value_kept or cell.value is None:
-            tag = with_attribute(with_attribute(tag, "t", _stored(cell.value)[0]), "vm", None)
+        value_unchanged = origin is not None and cell.value is origin.value
+        if origin is None or origin.position != position:
+            tag = set_attribute(tag, "r", cell_name(position))
+        if not value_unchanged or cell.value is None:
+            tag = set_attribute(set_attribute(tag, "t", _type_and_text(cell.value)[0]), "vm", None)
         if cell.formula is None:
-            tag = with_attribute(tag, "cm", None)
-        content = self._formula_xml(at, cell, split)
-        if value_kept and origin is not None:
-            inner, f = data[origin.element.inner : origin.element.close], origin.formula
-            if f is not None:
-                inner = inner[: f.start - origin.element.inner] + inner[f.end - origin.element.inner :]
+            tag = set_attribute(tag, "cm", None)
+        content = self._formula_xml(position, cell, split)
+        if value_unchanged and origin is not None:
+            inner, formula = data[origin.element.inner : origin.element.close], origin.formula
+            if formula is not None:
+                inner = inner[: formula.start - origin.element.inner] + inner[formula.end - origin.element.inner :]
             content += inner.strip()
         elif cell.value is not None:
-            content += b"<%bv>%b</%bv>" % (prefix, escaped(_stored(cell.value)[1]), prefix)
+            content += b"<%bv>%b</%bv>" % (prefix, escape_xml(_type_and_text(cell.value)[1]), prefix)
         return tag + content + b"</%bc>" % prefix if content else tag[:-1] + b"/>"
 
-    def _formula_xml(self, at: At, cell: Cell, split: set[str]) -> bytes:
+    def _formula_xml(self, position: Position, cell: Cell, split: set[str]) -> bytes:
+        """Return the XML of a cell's formula, byte by byte that of the file where it is unchanged."""
         origin = cell.origin
         if origin is not None and origin.formula is not None and origin.text == cell.formula:
-            plain = origin.formula.attributes.get("t", "normal") == "normal"
-            if plain or (origin.at == at and origin.group not in split):
+            is_normal = origin.formula.attributes.get("t", "normal") == "normal"
+            if is_normal or (origin.position == position and origin.shared_index not in split):
                 return self._data[origin.formula.start : origin.formula.end]
         if cell.formula is None:
             return b""
-        attributes = b' t="array" ref="%b"' % cell_name(at).encode() if cell.single_array else b""
+        attributes = b' t="array" ref="%b"' % cell_name(position).encode() if cell.is_single_array else b""
         text = cell.formula[1:]
         if text != text.strip():
             attributes += b' xml:space="preserve"'
-        return b"<%bf%b>%b</%bf>" % (self._prefix, attributes, escaped(text), self._prefix)
+        return b"<%bf%b>%b</%bf>" % (self._prefix, attributes, escape_xml(text), self._prefix)
 
-    def _start_tag(self, e: Element) -> bytes:
-        """An element's start tag, also of an element that has no end tag yet."""
-        tag = self._data[e.start : e.inner]
+    def _start_tag(self, element: Element) -> bytes:
+        """Return the start tag of an element; that of an empty element is opened: "<row/>" gives "<row>"."""
+        tag = self._data[element.start : element.inner]
         return tag[:-2].rstrip() + b">" if tag.endswith(b"/>") else tag
 
-    def _into_row(self, e: Element, row: int, cells: list[tuple[int, bytes]]) -> list[tuple[int, int, bytes]]:
-        tag = with_attribute(self._start_tag(e), "spans", None)
-        if e.inner == e.end:
-            return [(e.start, e.end, tag + b"".join(xml for _, xml in cells) + b"</%brow>" % self._prefix)]
-        changes = [(e.start, e.inner, tag)]
+    def _fill_row(self, element: Element, row: int, cells: list[tuple[int, bytes]]) -> list[tuple[int, int, bytes]]:
+        """Return the changes, for `splice`, that insert cells, (column, XML), into a row that the sheet has."""
+        tag = set_attribute(self._start_tag(element), "spans", None)
+        if element.inner == element.end:
+            return [(element.start, element.end, tag + b"".join(xml for _, xml in cells) + b"</%brow>" % self._prefix)]
+        changes = [(element.start, element.inner, tag)]
         for column, xml in cells:
-            at = min((other.start for c, other in self._in_row[row] if c > column), default=e.close)
-            changes.append((at, at, xml))
+            offset = min((e.start for c, e in self._cells_in_row[row] if c > column), default=element.close)
+            changes.append((offset, offset, xml))
         return changes
 
     def _new_row(self, row: int, cells: list[tuple[int, bytes]]) -> tuple[int, int, bytes]:
-        """The XML of a row, which is formatted as the one above."""
-        above = max((n for n in self._rows if n < row), default=None)
+        """Return the change, for `splice`, that inserts a row with these cells, formatted as the row above."""
+        above = max((number for number in self._rows if number < row), default=None)
         tag = b"<%brow>" % self._prefix if above is None else self._start_tag(self._rows[above])
         for attribute in ("spans", "hidden", "collapsed", "outlineLevel"):
-            tag = with_attribute(tag, attribute, None)
-        xml = with_attribute(tag, "r", str(row)) + b"".join(xml for _, xml in cells) + b"</%brow>" % self._prefix
-        at = min((e.start for n, e in self._rows.items() if n > row), default=self._sheet_data.close)
-        return at, at, xml
+            tag = set_attribute(tag, attribute, None)
+        xml = set_attribute(tag, "r", str(row)) + b"".join(xml for _, xml in cells) + b"</%brow>" % self._prefix
+        offset = min((e.start for n, e in self._rows.items() if n > row), default=self._sheet_data.close)
+        return offset, offset, xml
 
 
-def _same(a: Cell, b: Cell) -> bool:
-    return a == b and type(a.value) is type(b.value) and (a.style == b.style or a.origin is b.origin)
+def _is_unchanged(cell: Cell, original: Cell) -> bool:
+    """Return whether a cell has the content, the type of value and the style of the original."""
+    is_styled_alike = cell.style == original.style or cell.origin is original.origin
+    return cell == original and type(cell.value) is type(original.value) and is_styled_alike
 
 
-def _value(kind: str, parts: dict[str, Element], strings: list[str]) -> Any:
-    if kind == "inlineStr" and "is" in parts:
-        return _rich_text(parts["is"])
-    if "v" not in parts:
+def _read_value(cell_type: str, children: dict[str, Element], strings: list[str]) -> Any:
+    """Return the stored value of a cell from its attribute "t" and its child elements, None if it stores nothing."""
+    if cell_type == "inlineStr" and "is" in children:
+        return _rich_text(children["is"])
+    if "v" not in children:
         return None
-    text = parts["v"].text
-    if kind == "str":
+    text = children["v"].text
+    if cell_type == "str":
         return text
     text = text.strip()
     if not text:
         return None
     try:
-        if kind == "s":
+        if cell_type == "s":
             return strings[int(text)]
-        if kind == "b":
+        if cell_type == "b":
             return bool(int(text))
-        if kind == "n" and _NUMBER.fullmatch(text):
+        if cell_type == "n" and _NUMBER.fullmatch(text):
             return float(text)
     except (ValueError, IndexError):
-        return Unreadable(text)
-    return CellError(text) if kind == "e" else Unreadable(text)
+        return UnreadableValue(text)
+    return CellError(text) if cell_type == "e" else UnreadableValue(text)
 
 
-def _rich_text(e: Element) -> str:
-    """The text of a string's runs, without phonetic hints."""
-    return e.text if e.name == "t" else "".join(_rich_text(run) for run in e.children if run.name in ("t", "r"))
+def _rich_text(element: Element) -> str:
+    """Return the text of a string's runs, without phonetic hints."""
+    runs = (run for run in element.children if run.name in ("t", "r"))
+    return element.text if element.name == "t" else "".join(map(_rich_text, runs))
 
 
-def shared_strings(found: list[Element]) -> list[str]:
-    """The texts in the elements of the part of shared strings."""
-    return [_rich_text(e) for e in found if e.name == "si" and e.namespace == MAIN]
+def shared_strings(elements: list[Element]) -> list[str]:
+    """Return the texts of the workbook's shared strings, from all elements of their part."""
+    return [_rich_text(e) for e in elements if e.name == "si" and e.namespace == MAIN]
 
 
-def moved(formula: str | None, start: At, to: At) -> str | None:
-    """A formula as it reads when copied from `start` to `to`."""
+def translate_formula(formula: str | None, start: Position, target: Position) -> str | None:
+    """Return the formula of the cell `start` as a spreadsheet writes it when the cell is copied to `target`."""
     from openpyxl.formula.translate import Translator, TranslatorError
 
-    if formula is None or start == to:
+    if formula is None or start == target:
         return formula
     try:
-        return str(Translator(formula, cell_name(start)).translate_formula(cell_name(to)))
+        return str(Translator(formula, cell_name(start)).translate_formula(cell_name(target)))
     except TranslatorError:
         return "=#REF!"
 
 
-def _stored(value: Any) -> tuple[str | None, str]:
-    """The type of a value, as its cell's attribute, and its text."""
+def _type_and_text(value: Any) -> tuple[str | None, str]:
+    """Return the attribute "t" of a cell that stores `value`, and the text of the value in the XML."""
     if isinstance(value, bool):
         return "b", str(int(value))
     if isinstance(value, str):

@@ -1,15 +1,15 @@
-"""The sheets of a workbook file as cells that can be changed, and the file with the changes."""
+"""Worksheets of a workbook file as cells that can be changed, and the bytes of the file with the changes."""
 
 import itertools
 import re
 from functools import cached_property
 
 from ..errors import InputError
-from .formulas import areas_in, operands
-from .package import CONTENT_TYPES, Package, relations_part, spliced, with_attribute
-from .sheet_xml import MAIN, STRICT, At, Cell, Reference, SheetXml, cell_name, reference, shared_strings
+from .formulas import referenced_areas, references_and_names
+from .package import CONTENT_TYPES, Package, relations_part, set_attribute, splice
+from .sheet_xml import MAIN, STRICT, Cell, Position, Reference, SheetXml, cell_name, parse_reference, shared_strings
 
-KINDS = {
+CONTENT_TYPE_OF_SUFFIX = {
     ".xlsx": "application/vnd.openxmlformats-officedocument.spreadsheetml.sheet.main+xml",
     ".xlsm": "application/vnd.ms-excel.sheet.macroEnabled.main+xml",
 }
@@ -17,35 +17,35 @@ _BEFORE_CALC_PR = (
     *("fileVersion", "fileSharing", "workbookPr", "workbookProtection", "bookViews", "sheets", "functionGroups"),
     *("externalReferences", "definedNames"),
 )
+"""Elements that the schema of a workbook part puts before "calcPr"."""
 _RELATIONS = "http://schemas.openxmlformats.org/officeDocument/2006/relationships"
 _WORKSHEET = "application/vnd.openxmlformats-officedocument.spreadsheetml.worksheet+xml"
-Place = tuple[str, int, int]
-"""Sheet, row, column."""
+Address = tuple[str, int, int]
+"""Sheet, row and column of a cell, the latter two counted from 1."""
 
 
 class WorkbookXml:
-    """The worksheets of a workbook file with these bytes; messages call it `name`.
-
-    `parts` has the member of the package of each worksheet, in the workbook's order, `all_sheets` the names of all sheets,
-    also of charts, and `hidden` those of the sheets that are not shown.
-    """
+    """Worksheets of a workbook file, parsed when they are needed; `name` is the file's name in messages."""
 
     def __init__(self, content: bytes, name: str) -> None:
         self.name = name
         self.package = Package(content, name)
-        found = [member for _, kind, member in self.package.relations("") if kind == "officeDocument"]
-        if not found:
+        documents = [member for _, kind, member in self.package.relations("") if kind == "officeDocument"]
+        if not documents:
             raise InputError(f"{name}: not a whole .xlsx workbook (it does not say where its sheets are)")
-        self._part = found[0]
-        found_elements = self.package.elements(self._part)
-        if found_elements[0].namespace == STRICT:
+        self._part = documents[0]
+        elements = self.package.elements(self._part)
+        if elements[0].namespace == STRICT:
             raise InputError(f"{name}: a 'Strict Open XML Spreadsheet', expected it saved as 'Excel Workbook (*.xlsx)'")
-        self._elements = [e for e in found_elements if e.namespace == MAIN]
+        self._elements = [e for e in elements if e.namespace == MAIN]
         relations = self.package.relations(self._part)
         self._related = {kind: member for _, kind, member in reversed(relations)}
         self.all_sheets: list[str] = []
+        """Names of all sheets in the workbook's order, sheets of charts included."""
         self.hidden: set[str] = set()
+        """Names of the sheets that are not shown."""
         self.parts: dict[str, str] = {}
+        """Name of each worksheet, in the workbook's order -> its member of the package."""
         self._parsed: dict[str, SheetXml] = {}
         worksheets = {key: member for key, kind, member in relations if kind == "worksheet"}
         for e in self._elements:
@@ -53,205 +53,211 @@ class WorkbookXml:
                 continue
             title = e.attributes.get("name", "")
             if title.casefold() in map(str.casefold, self.all_sheets):
-                twice = f"has two sheets called {title}, expected one"
-                raise InputError(f"{name}: {twice}; Excel or LibreOffice may repair it")
+                problem = f"has two sheets called {title}, expected one"
+                raise InputError(f"{name}: {problem}; Excel or LibreOffice may repair it")
             self.all_sheets.append(title)
             if e.attributes.get("state", "visible") != "visible":
                 self.hidden.add(title)
             key = next((value for attribute, value in e.attributes.items() if attribute.endswith(" id")), "")
             if key in worksheets:
                 self.parts[title] = worksheets[key]
-        self._by_folded_name = {title.casefold(): title for title in self.parts}
-        self._extents: dict[tuple[str, int], At] = {}
+        self._title_of_folded = {title.casefold(): title for title in self.parts}
+        self._extents: dict[tuple[str, int], Position] = {}
 
     def sheet(self, title: str) -> SheetXml:
-        """A worksheet, parsed when it is first asked for: users' workbooks carry large ones that nobody needs."""
+        """Return a worksheet, parsed at the first call: users' workbooks have large sheets that are never needed."""
         if title not in self._parsed:
             self._parsed[title] = SheetXml(self.package.read(self.parts[title]), self._strings, title, self.name)
         return self._parsed[title]
 
     @cached_property
     def _strings(self) -> list[str]:
+        """Shared strings, to which the cells of all sheets refer by index."""
         part = self._related.get("sharedStrings")
         return [] if part is None else shared_strings(self.package.elements(part))
 
     @property
     def suffix(self) -> str | None:
-        """ ".xlsx" or ".xlsm" by the content, None for anything else."""
-        kind = self.package.content_type(self._part)
-        return next((suffix for suffix, content_type in KINDS.items() if kind == content_type), None)
+        """Ending that fits the file's content: ".xlsx", ".xlsm", or None for another kind of file."""
+        content_type = self.package.content_type(self._part)
+        return next((suffix for suffix, kind in CONTENT_TYPE_OF_SUFFIX.items() if kind == content_type), None)
 
     @property
     def asks_for_calculation(self) -> bool:
         """Whether the file says that the formulas' stored values are not to be relied on."""
         settings = [e.attributes for e in self._elements if e.name == "calcPr"]
-        asked = any(a.get(name) in ("1", "true") for a in settings for name in ("fullCalcOnLoad", "forceFullCalc"))
-        return asked or any(a.get("calcCompleted") in ("0", "false") for a in settings)
+        is_asked = any(a.get(name) in ("1", "true") for a in settings for name in ("fullCalcOnLoad", "forceFullCalc"))
+        return is_asked or any(a.get("calcCompleted") in ("0", "false") for a in settings)
 
     @cached_property
     def _number_formats(self) -> list[str]:
-        """The number format of each style of cells."""
+        """Number format of each style of cells, by the style's number."""
         from openpyxl.styles.numbers import BUILTIN_FORMATS
 
-        parts = self.package.elements(self._related["styles"]) if "styles" in self._related else []
-        named = [e.attributes for e in parts if e.name == "numFmt"]
-        own = {attributes.get("numFmtId"): attributes.get("formatCode", "") for attributes in named}
-        styles = [e for e in parts if e.name == "xf" and e.parent is not None and e.parent.name == "cellXfs"]
+        elements = self.package.elements(self._related["styles"]) if "styles" in self._related else []
+        declared = [e.attributes for e in elements if e.name == "numFmt"]
+        custom_formats = {attributes.get("numFmtId"): attributes.get("formatCode", "") for attributes in declared}
+        styles = [e for e in elements if e.name == "xf" and e.parent is not None and e.parent.name == "cellXfs"]
         ids = [e.attributes.get("numFmtId", "0") for e in styles]
-        return [own[i] if i in own else BUILTIN_FORMATS.get(int(i), "") for i in ids]
+        return [custom_formats[i] if i in custom_formats else BUILTIN_FORMATS.get(int(i), "") for i in ids]
 
     def number_format(self, cell: Cell) -> str:
-        """The number format of a cell, such as ``0.00" mm"``."""
+        """Return the number format of a cell, such as ``0.00" mm"``."""
         style = int(cell.style or 0)
         return self._number_formats[style] if style < len(self._number_formats) else ""
 
-    def comments(self, sheet: str) -> dict[At, str]:
-        """The comments on a sheet's cells."""
-        found: dict[At, str] = {}
-        for member in self._related_to(sheet, "comments"):
-            at = None
+    def comments(self, sheet: str) -> dict[Position, str]:
+        """Return the comments on a sheet's cells: position -> text."""
+        comments: dict[Position, str] = {}
+        for member in self._related_members(sheet, "comments"):
+            position = None
             for e in self.package.elements(member):
-                if e.name == "comment" and (cell := reference(e.attributes.get("ref", ""))) is not None:
-                    at = cell.top, cell.left
-                elif e.name == "t" and at is not None:
-                    found[at] = found.get(at, "") + e.text
-        return found
+                if e.name == "comment" and (cell := parse_reference(e.attributes.get("ref", ""))) is not None:
+                    position = cell.top, cell.left
+                elif e.name == "t" and position is not None:
+                    comments[position] = comments.get(position, "") + e.text
+        return comments
 
     @cached_property
     def _names(self) -> dict[tuple[str | None, str], str]:
-        """(sheet or None, case-folded defined name) -> formula."""
+        """(sheet that the name is limited to, or None; case-folded defined name) -> formula."""
         names = {}
         for e in self._elements:
             if e.name == "definedName" and e.text.strip():
                 scope = e.attributes.get("localSheetId", "")
-                at = int(scope) if scope.isdigit() else -1
-                sheet = self.all_sheets[at] if 0 <= at < len(self.all_sheets) else None
+                index = int(scope) if scope.isdigit() else -1
+                sheet = self.all_sheets[index] if 0 <= index < len(self.all_sheets) else None
                 names[sheet, e.attributes.get("name", "").casefold()] = f"={e.text.strip()}"
         return names
 
     @cached_property
     def tables(self) -> dict[str, Reference]:
-        """Case-folded name of an Excel table -> its cells."""
-        found = {}
+        """Case-folded name of each Excel table -> its area."""
+        areas = {}
         for title in self.parts:
-            for member in self._related_to(title, "table"):
+            for member in self._related_members(title, "table"):
                 attributes = self.package.elements(member)[0].attributes
-                if (area := reference(attributes.get("ref", ""))) is not None:
-                    found[attributes.get("displayName", "").casefold()] = area._replace(sheet=title)
-        return found
+                if (area := parse_reference(attributes.get("ref", ""))) is not None:
+                    areas[attributes.get("displayName", "").casefold()] = area._replace(sheet=title)
+        return areas
 
-    def _related_to(self, sheet: str, kind: str) -> list[str]:
-        return [member for _, its, member in self.package.relations(self.parts[sheet]) if its == kind]
+    def _related_members(self, sheet: str, kind: str) -> list[str]:
+        """Return the members of the package that a worksheet refers to by a relationship of this kind."""
+        return [member for _, relation, member in self.package.relations(self.parts[sheet]) if relation == kind]
 
-    def title(self, name: str | None) -> str | None:
-        """A sheet's name as the workbook writes it, given in whatever case."""
-        return None if name is None else self._by_folded_name.get(name.casefold())
+    def find_title(self, name: str | None) -> str | None:
+        """Return the name of a worksheet as the workbook writes it, for a name in any case; None without such a sheet."""
+        return None if name is None else self._title_of_folded.get(name.casefold())
 
-    def cell(self, place: Place) -> Cell:
-        """A cell as it is now."""
-        return self.sheet(place[0]).cell(place[1:])
+    def cell(self, address: Address) -> Cell:
+        """Return the present content of a cell."""
+        return self.sheet(address[0]).cell(address[1:])
 
-    def put(self, place: Place, cell: Cell) -> None:
-        """Give a place another content."""
-        self.sheet(place[0]).cells[place[1:]] = cell
+    def set_cell(self, address: Address, cell: Cell) -> None:
+        """Replace the content of a cell."""
+        self.sheet(address[0]).cells[address[1:]] = cell
 
     @property
-    def formulas(self) -> dict[Place, Cell]:
-        """The cells with formulas, or of array formulas, of all sheets."""
+    def formulas(self) -> dict[Address, Cell]:
+        """Cells of all sheets that have a formula or belong to an array formula."""
         return {
-            (title, *at): cell
+            (title, *position): cell
             for title in self.parts
-            for at, cell in self.sheet(title).cells.items()
+            for position, cell in self.sheet(title).cells.items()
             if cell.formula is not None or cell.array is not None
         }
 
     @cached_property
-    def never_calculated(self) -> bool:
+    def was_never_calculated(self) -> bool:
         """Whether every formula stores 0 or nothing, as programs that cannot calculate, such as XlsxWriter, leave it."""
         return not any(cell.value or cell.value is False for cell in self.formulas.values())
 
-    def meaning(self, sheet: str, name: str) -> str | None:
-        """The formula that a defined name stands for on `sheet`; None if it is unknown or depends on the cell."""
-        own, _, plain = name.rpartition("!")
-        scope, key = self.title(own.strip("'")) if own else sheet, plain.casefold()
+    def defined_formula(self, sheet: str, name: str) -> str | None:
+        """Return the formula that a defined name stands for on `sheet`; None if it is unknown or depends on the cell."""
+        scope_text, _, plain_name = name.rpartition("!")
+        scope, key = self.find_title(scope_text.strip("'")) if scope_text else sheet, plain_name.casefold()
         formula = self._names.get((scope, key)) or self._names.get((None, key))
-        areas = [text for text in operands(formula or "") if reference(text) is not None]
-        cells = [text.rpartition("!")[2] for text in areas]  # Main!$B$3 means the same everywhere, Main!B3 does not
+        references = [text for text in references_and_names(formula or "") if parse_reference(text) is not None]
+        # Main!$B$3 means the same cell everywhere, Main!B3 does not.
+        cells = [text.rpartition("!")[2] for text in references]
         return formula if all(text.count("$") == len(re.findall(r"[A-Za-z]+|\d+", text)) for text in cells) else None
 
-    def extent(self, sheet: str) -> At:
-        """The last row and the last column of `sheet` with content."""
-        key = sheet, len(self.sheet(sheet).cells)  # which grows when rows are added; emptied cells do no harm
+    def extent(self, sheet: str) -> Position:
+        """Return the last row and the last column of `sheet` with content."""
+        # The number of cells changes when rows are added; emptied cells only make the extent too large.
+        key = sheet, len(self.sheet(sheet).cells)
         if key not in self._extents:
-            filled = [at for at, cell in self.sheet(sheet).cells.items() if not cell.blank]
+            filled = [position for position, cell in self.sheet(sheet).cells.items() if not cell.blank]
             rows, columns = {row for row, _ in filled}, {column for _, column in filled}
             self._extents[key] = max(rows, default=0), max(columns, default=0)
         return self._extents[key]
 
-    def ranges_ending_at(self, sheet: str, last: int) -> list[str]:
-        """The names, charts, tables and formulas that refer to several rows of `sheet` of which `last` is the last."""
+    def describe_ranges_ending_at(self, sheet: str, row: int) -> list[str]:
+        """Return what refers to several rows of `sheet` of which `row` is the last: names, charts, tables, formulas."""
 
-        def ends_there(area: Reference | None, own: str = "") -> bool:
-            return area is not None and area.top < area.bottom == last and sheet == (self.title(area.sheet) or own)
+        def ends_there(area: Reference | None, host: str = "") -> bool:
+            """Return whether an area ends at the row; `host` is the sheet of the formula, for an area without a sheet."""
+            return area is not None and area.top < area.bottom == row and sheet == (self.find_title(area.sheet) or host)
 
-        found = [
+        texts = [
             f"the name {name}"
             for (_, name), formula in self._names.items()
-            if name != "_xlnm._filterdatabase" and any(map(ends_there, areas_in(formula)))
+            if name != "_xlnm._filterdatabase" and any(map(ends_there, referenced_areas(formula)))
         ]
         for member in self.package.names:
             if member.startswith("xl/charts/") and member.endswith(".xml"):
-                series = [reference(e.text.strip()) for e in self.package.elements(member) if e.name == "f"]
-                found += [f"the chart {member}"] * any(map(ends_there, series))
-        found += [f"the table {name}" for name, area in self.tables.items() if ends_there(area)]
-        return found + [
-            self.text(place)
-            for place, cell in self.formulas.items()
-            if any(ends_there(area, place[0]) for area in areas_in(cell.formula or ""))
+                series = [parse_reference(e.text.strip()) for e in self.package.elements(member) if e.name == "f"]
+                texts += [f"the chart {member}"] * any(map(ends_there, series))
+        texts += [f"the table {name}" for name, area in self.tables.items() if ends_there(area)]
+        return texts + [
+            self.address_text(address)
+            for address, cell in self.formulas.items()
+            if any(ends_there(area, address[0]) for area in referenced_areas(cell.formula or ""))
         ]
 
     @staticmethod
-    def text(place: Place) -> str:
-        """E.g. ``Coordinates!B3``."""
-        return f"{place[0]}!{cell_name(place[1:])}"
+    def address_text(address: Address) -> str:
+        """Return the text of a cell's address, such as ``Coordinates!B3``."""
+        return f"{address[0]}!{cell_name(address[1:])}"
 
     @property
-    def changed(self) -> list[Place]:
-        """The cells that are not as they were read."""
-        return [(title, *at) for title, sheet in self._parsed.items() for at in sheet.changed]
+    def changed_addresses(self) -> list[Address]:
+        """Addresses of the cells that differ from the file."""
+        return [(title, *position) for title, sheet in self._parsed.items() for position in sheet.changed_positions]
 
     def to_bytes(self) -> bytes:
-        """The workbook with the changed cells; spreadsheet programs will recalculate it when they open it."""
-        changed = {title: sheet for title, sheet in self._parsed.items() if sheet.changed}
+        """Return the workbook with the changed cells; spreadsheet programs will recalculate it when they open it."""
+        changed = {title: sheet for title, sheet in self._parsed.items() if sheet.changed_positions}
         if not changed:
             return self.package.content
         parts = {self.parts[title]: sheet.to_bytes() for title, sheet in changed.items()}
-        parts[self._part] = self._recalculated_on_load()
-        stale_chain = "calcChain" in self._related and any(s.formulas_added_or_removed for s in changed.values())
-        return self.package.with_parts(parts, [self._related["calcChain"]] if stale_chain else [], self._part)
+        parts[self._part] = self._part_with_calculation_on_load()
+        is_chain_stale = "calcChain" in self._related and any(s.formulas_added_or_removed for s in changed.values())
+        return self.package.replace_parts(parts, [self._related["calcChain"]] if is_chain_stale else [], self._part)
 
-    def with_sheet(self, title: str, rows: str) -> bytes:
-        """The workbook with one more sheet, last, that consists of these rows' XML."""
-        add, taken = self.package.with_last, {name.casefold() for name in self.package.names}
-        number = next(n for n in itertools.count(1) if f"xl/worksheets/sheet{n}.xml" not in taken)
+    def to_bytes_with_sheet(self, title: str, rows: str) -> bytes:
+        """Return the workbook as it was read, with one more sheet behind the others; `rows` is the XML of its rows."""
+        append, members = self.package.append_element, {name.casefold() for name in self.package.names}
+        number = next(n for n in itertools.count(1) if f"xl/worksheets/sheet{n}.xml" not in members)
         part, key, kind = f"xl/worksheets/sheet{number}.xml", f"rIdSheet{number}", f"{_RELATIONS}/worksheet"
         ids = [int(e.attributes.get("sheetId", "0")) for e in self._elements if e.name == "sheet"]
-        named = {"name": title, "sheetId": str(max(ids, default=0) + 1), "xmlns_r": _RELATIONS, "r_id": key}
+        attributes = {"name": title, "sheetId": str(max(ids, default=0) + 1), "xmlns_r": _RELATIONS, "r_id": key}
         relations = relations_part(self._part)
         parts = {
-            self._part: add(self._part, "sheets", "sheet", **named),
-            relations: add(relations, "Relationships", "Relationship", Id=key, Type=kind, Target=f"/{part}"),
-            CONTENT_TYPES: add(CONTENT_TYPES, "Types", "Override", PartName=f"/{part}", ContentType=_WORKSHEET),
+            self._part: append(self._part, "sheets", "sheet", **attributes),
+            relations: append(relations, "Relationships", "Relationship", Id=key, Type=kind, Target=f"/{part}"),
+            CONTENT_TYPES: append(CONTENT_TYPES, "Types", "Override", PartName=f"/{part}", ContentType=_WORKSHEET),
             part: f'<worksheet xmlns="{MAIN}"><sheetData>{rows}</sheetData></worksheet>'.encode(),
         }
-        return self.package.with_parts(parts)
+        return self.package.replace_parts(parts)
 
-    def _recalculated_on_load(self) -> bytes:
+    def _part_with_calculation_on_load(self) -> bytes:
+        """Return the XML of the workbook part that asks programs to calculate all formulas when they open the file."""
         root, data = self._elements[0], self.package.read(self._part)
         for e in root.children:
             if e.name == "calcPr" and e.namespace == MAIN:
-                tag = with_attribute(data[e.start : e.inner], "fullCalcOnLoad", "1")
-                return spliced(data, [(e.start, e.inner, tag)])
-        at = max(e.end for e in root.children if e.namespace == MAIN and e.name in _BEFORE_CALC_PR)
+                tag = set_attribute(data[e.start : e.inner], "fullCalcOnLoad", "1")
+                return splice(data, [(e.start, e.inner, tag)])
+        offset = max(e.end for e in root.children if e.namespace == MAIN and e.name in _BEFORE_CALC_PR)
         prefix = data[root.start + 1 : root.inner].split(b"workbook", 1)[0]
-        return spliced(data, [(at, at, b'<%bcalcPr fullCalcOnLoad="1"/>' % prefix)])
+        return splice(data, [(offset, offset, b'<%bcalcPr fullCalcOnLoad="1"/>' % prefix)])

@@ -14,7 +14,7 @@ from ..physics.ct_numbers import CT_ENERGY, hu_to_mu
 from ..physics.materials import attenuation
 from ..progress import Progress, part_of
 from ..projector import Model, Projector, Transmission
-from ..projector.bundles import Beam
+from ..rays.bundles import Beam
 from ..volumes.volume import Volume
 from .decomposition import correct_beam_hardening, virtual_monoenergetic
 from .detectors import EnergyIntegrator, PanelDetector, PhotonCounter

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
-KERNELS = "core/projector/backends/kernels"
+KERNELS = "core/rays/backends/kernels"
 MODULE = "bl_ext.user_default.mphdrr"
 
 
@@ -73,7 +73,7 @@ assert hasattr(bpy.ops, "mphdrr") and "MPHDRR_PT_geometry" in dir(bpy.types)
 for name in ("h5py", "openjpeg", "psutil", "openpyxl", "nibabel", "trimesh"):
     module = importlib.import_module(name)
     assert ".local" in module.__file__, module.__file__  # from the extension's wheels, not from the machine
-cpu = importlib.import_module("{MODULE}.core.projector.backends.cpu")
+cpu = importlib.import_module("{MODULE}.core.rays.backends.cpu")
 assert cpu.levels(), "the kernels"
 cache = importlib.import_module("{MODULE}.core.cache")
 assert str(cache.folder()) == bpy.utils.extension_path_user("{MODULE}", path="cache"), cache.folder()

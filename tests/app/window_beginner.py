@@ -15,7 +15,7 @@ def clicks(name: str) -> Iterator[float]:
     """Click until a score stands; yields what to wait for."""
     scene, seen[name] = bpy.context.scene, []
     scene.mphdrr_reconstruction.voxels, scene.mphdrr_reconstruction.iterations = 32, 4  # for speed
-    while not scene.mphdrr_reconstruction.known.get("scores") and len(seen[name]) < _MOST:
+    while not scene.mphdrr_reconstruction.details.get("scores") and len(seen[name]) < _MOST:
         seen[name].append(proposed())
         click_proposed()
         yield from idle()

@@ -33,8 +33,8 @@ def place_of(number: int, pixel: tuple[float, float]) -> tuple[int, int]:
     """Where on the screen a module's tile has a pixel."""
     _, area, region = editor("IMAGE_EDITOR")
     image = area.spaces.active.image
-    (tile,) = (each for each in tiles.pictures(image) if each.number == number)
-    row, column = tile.places(pixel, epipolar.run_views(bpy.context.scene).views.shape)
+    (tile,) = (each for each in tiles.shown_pictures(image) if each.number == number)
+    row, column = tile.image_positions(pixel, epipolar.run_views(bpy.context.scene).views.shape)
     return on_screen(*region.view2d.view_to_region(column / image.size[0], 1 - row / image.size[1]), "IMAGE_EDITOR")
 
 
@@ -57,7 +57,7 @@ def slider() -> tuple[int, int]:
 
 def pixel() -> list[float]:
     """The number of the module and its pixel that are picked."""
-    found = epipolar.picked(bpy.context.scene)
+    found = epipolar.picked_pixel(bpy.context.scene)
     return [found.run.numbers[found.index], *found.pixel.tolist()]
 
 
@@ -115,14 +115,14 @@ def steps():
     xdotool("mousemove", *at)
     yield 0.5
     xdotool("click", 1)
-    yield lambda: epipolar.picked(scene) is not None
+    yield lambda: epipolar.picked_pixel(scene) is not None
     yield from drawn()
-    found = epipolar.picked(scene)
+    found = epipolar.picked_pixel(scene)
     seen["picked"] = None if found is None else [*pixel(), found.seen_by]
     picture("picked")
     press(bpy.ops.image.view_all, "EXEC_DEFAULT", kind="IMAGE_EDITOR", fit_view=True)
     yield from drawn()
-    before = found.places
+    before = found.marker_pixels
     x, y = slider()
     wanted = found.k / SHARE
     front, back = found.k_range
@@ -142,12 +142,12 @@ def steps():
         yield 0.25
     xdotool("mouseup", 1)
     yield from drawn()
-    found = epipolar.picked(scene)
+    found = epipolar.picked_pixel(scene)
     seen["k"] = [wanted, found.k, len(set(trail))]
     seen["marker"] = found.marker.tolist()
-    seen["moved"] = float(np.nanmedian(np.linalg.norm(found.places - before, axis=1)))
+    seen["moved"] = float(np.nanmedian(np.linalg.norm(found.marker_pixels - before, axis=1)))
     off = []
-    for number, place in zip(found.run.numbers, found.places, strict=True):
+    for number, place in zip(found.run.numbers, found.marker_pixels, strict=True):
         exact = images.projection_array(bpy.data.images[f"mphDRR {number}" if number > 9 else f"mphDRR 0{number}"])
         exact = exact.astype(float)
         rows, columns = np.indices(exact.shape)
@@ -161,7 +161,7 @@ def steps():
     started = own_time()
     for k in np.linspace(front, back, 50):
         scene.mphdrr_epipolar.k = k
-        epipolar.picked(scene)
+        epipolar.picked_pixel(scene)
     seen["ms for each k"] = 20 * (own_time() - started)
     scene.mphdrr_epipolar.k = found.k
     yield from drawn()

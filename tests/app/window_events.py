@@ -75,9 +75,9 @@ def steps():
     bpy.data.objects.remove(bpy.data.objects["Cube"])
     (folder / "events.toml").write_text(RECIPE)
     settings.recipe, settings.folder, settings.count = str(folder / "events.toml"), str(folder / "set"), 12
-    while event_notes.of_recipe(settings.recipe).text == "Reading …":
+    while event_notes.recipe_note(settings.recipe).text == "Reading …":
         yield 0.1
-    note = event_notes.of_recipe(settings.recipe)
+    note = event_notes.recipe_note(settings.recipe)
     seen["note"] = [note.text, note.is_wrong]
     for _ in range(3):
         yield from job(mph.try_event)
@@ -121,7 +121,7 @@ def steps():
     settings.opened = 3
     yield from job(mph.open_event)
     scene = bpy.context.scene
-    seen["opened"], seen["run"] = scene.mphdrr_events.truth.name, runs.shown(scene).name
+    seen["opened"], seen["run"] = scene.mphdrr_events.truth.name, runs.shown_run(scene).name
     seen["image"] = editor("IMAGE_EDITOR")[1].spaces.active.image.name
     seen["changes"] = runs.changes(scene)
     yield 3.0  # until the note of the set is read

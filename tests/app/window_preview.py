@@ -26,7 +26,7 @@ def timed(function):
 original = preview.after_update
 handlers = bpy.app.handlers.depsgraph_update_post
 handlers[handlers.index(original)] = timed(original)
-preview._look = timed(preview._look)
+preview._take_turn = timed(preview._take_turn)
 preview.preview_drawing._draw_box = timed(preview.preview_drawing._draw_box)
 preview.preview_drawing._draw_plane = timed(preview.preview_drawing._draw_plane)
 
@@ -52,7 +52,7 @@ def figures(name, times):
 
 def at_rest() -> bool:
     """Whether the preview has all pixels of what there is."""
-    shown = preview.session().shown
+    shown = preview.session().preview
     return shown is not None and not shown.is_quick
 
 
@@ -83,27 +83,27 @@ def steps():
     bpy.ops.mphdrr.live_preview()
     session = preview.session()
     yield at_rest
-    seen["first"] = [session.problem, session.lines, session.shown is not None and not session.shown.is_quick]
+    seen["first"] = [session.problem, session.lines, session.preview is not None and not session.preview.is_quick]
     times, quick = [], []
     for number in range(MOVES):
         spent["move"] = 0.0
         (camera, phantom)[number % 2].location.x += 0.5 if number % 4 < 2 else -0.45
         yield 0.15
         times.append(1e3 * spent["move"])
-        quick.append(session.shown.is_quick)
+        quick.append(session.preview.is_quick)
     figures("on", times)
     seen["quick"] = sum(quick)
     yield at_rest
-    seen["full"] = not session.shown.is_quick
-    run = session.shown.run
+    seen["full"] = not session.preview.is_quick
+    run = session.preview.run
     volume = volumes.volume_from_object(phantom)
     exact = core.Projector(volume.grid, run.system.views((256, 256)))(volume)
     seen["differs"] = float(np.abs(run.projections - exact).max() / exact.max())
     seen["largest"] = float(exact.max())
     seen["same place"] = bool(np.allclose(run.system.centers[0], camera.location, atol=1e-5))
     camera.mphdrr_module.collimator_length = 60.0
-    yield lambda: at_rest() and session.shown.run.system.collimator_length[0] == 60.0
-    seen["typed"] = float(session.shown.run.system.collimator_length[0])
+    yield lambda: at_rest() and session.preview.run.system.collimator_length[0] == 60.0
+    seen["typed"] = float(session.preview.run.system.collimator_length[0])
     camera.mphdrr_module.pinhole_diameter = 400.0
     yield lambda: session.problem
     seen["impossible"] = session.problem
@@ -112,9 +112,9 @@ def steps():
     seen["again"] = session.problem
     seen["images"] = (set(bpy.data.images.keys()), set(bpy.data.objects.keys())) == names
     scene.mphdrr_projections.model, phantom.display_type = "EMISSION", "TEXTURED"
-    yield lambda: session.shown.run.unit == "counts" and at_rest()
+    yield lambda: session.preview.run.unit == "counts" and at_rest()
     yield from drawn()
-    seen["unit"] = session.shown.run.unit
+    seen["unit"] = session.preview.run.unit
     drawing, _, region = preview.preview_drawing, *editor()[1:]
     left, bottom, right, top = drawing._boxes[region.as_pointer()][0]
     xdotool("mousemove", *on_screen((left + right) / 2, (bottom + top) / 2))

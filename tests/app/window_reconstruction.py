@@ -28,7 +28,7 @@ def steps():
     press(bpy.ops.mphdrr.reconstruct)
     while len(seen["iterations"]) < 2:
         yield 0.5
-        known = bpy.context.scene.mphdrr_reconstruction.known
+        known = bpy.context.scene.mphdrr_reconstruction.details
         if known and len(known["objective"]) not in seen["iterations"]:
             seen["iterations"].append(len(known["objective"]))
             seen["while"] = bpy.context.scene.mphdrr_reconstruction.volume.name
@@ -36,11 +36,11 @@ def steps():
     bpy.ops.mphdrr.finish_job()
     yield from idle()
     scene = bpy.context.scene
-    done = len(scene.mphdrr_reconstruction.known["objective"])
+    done = len(scene.mphdrr_reconstruction.details["objective"])
     press(bpy.ops.mphdrr.continue_reconstruction)
     yield from idle()
     yield 1.0
-    known = scene.mphdrr_reconstruction.known
+    known = scene.mphdrr_reconstruction.details
     seen["continued"] = len(known["objective"]) - done
     seen["title"], seen["rods"] = known["title"], [name for name, *_ in known["rods"]]
     seen["hidden"] = [item.name for item in scene.objects if item.type == "VOLUME" and item.hide_get()]

@@ -49,11 +49,11 @@ def steps():
     yield from drawn()
     changes("rendered")
     bpy.context.scene.mphdrr_projections.active_run = 0  # as a click in the list does, which starts a job
-    yield lambda: runs.shown(bpy.context.scene).name == "As imported"
+    yield lambda: runs.shown_run(bpy.context.scene).name == "As imported"
     yield from idle()
     yield from drawn()
     changes("chosen")
-    seen["shown"] = runs.shown(bpy.context.scene).name
+    seen["shown"] = runs.shown_run(bpy.context.scene).name
     press(bpy.ops.mphdrr.compare_runs, other="1")
     yield from idle()
     yield from drawn()

@@ -32,7 +32,7 @@ def steps():
     press(bpy.ops.mphdrr.add_slices, "EXEC_DEFAULT")
     nema = bpy.context.object
     settings, nema_name = nema.mphdrr_volume, nema.name
-    affine = slices._stored(nema).grid.affine
+    affine = slices._read_volume(nema).grid.affine
     middle = (-affine[:3, 3] / affine.diagonal()[:3]).round().astype(int).tolist()
     settings.slices = middle
     settings.display_low = 5.5  # above the background
@@ -50,7 +50,7 @@ def steps():
     yield from drawn()
     picture("slices")
     before = list(settings.slices)
-    start, step = slices.way(nema, 2)
+    start, step = slices.slice_track(nema, 2)
     handle = start + step * before[2]
     ends = place(handle + step * 6), place(handle + step * 16)
     seen["arrow"] = ends
@@ -104,7 +104,7 @@ def steps():
     yield from drawn()
     picture("map")
     seen["map"] = [place((0.0, 0.0, 0.0)), place((60.0, -60.0, 60.0))]
-    left, bottom, width, height = color_bar.place()
+    left, bottom, width, height = color_bar.rectangle()
     seen["bar"] = [*on_screen(left, bottom + height - 1), width, height]
     space.show_region_ui = True
     bpy.context.view_layer.objects.active = bpy.data.objects["Sensitivity map"]

@@ -43,7 +43,7 @@ def test_the_volume_is_that_of_the_command_line(rendered, scene, how):
     np.testing.assert_allclose(found.array, expected.array, rtol=1e-6)
     np.testing.assert_allclose(found.grid.affine, expected.grid.affine, atol=1e-6)
     assert len(slices.planes_of(item)) == 3 and item.mphdrr_volume.display_high == pytest.approx(expected.array.max())
-    assert color_bar.marks(item)[0].startswith("backprojection")
+    assert color_bar.labels(item)[0].startswith("backprojection")
 
 
 def test_it_has_the_panels_voxels_and_stands_beside_the_last_one(rendered, scene):
@@ -69,7 +69,7 @@ def test_it_is_written_and_read_like_other_volumes(rendered, scene, tmp_path):
 def test_cancelled_it_leaves_everything_as_it_was(rendered, scene):
     before = sorted(item.name for item in bpy.data.objects), sorted(storage.folder().iterdir())
     panel = scene.mphdrr_reconstruction
-    job = backprojections.backprojecting(bpy.context, voxels_recipe(lambda name: getattr(panel, name)), "product")
+    job = backprojections.backproject_job(bpy.context, voxels_recipe(lambda name: getattr(panel, name)), "product")
 
     def progress(done: int, total: int) -> None:
         if done and total:
@@ -83,4 +83,4 @@ def test_cancelled_it_leaves_everything_as_it_was(rendered, scene):
 def test_without_a_run_it_says_why(scene):
     assert not bpy.ops.mphdrr.backproject.poll()
     with pytest.raises(mph.InputError, match="nothing to back-project"):
-        backprojections.backprojecting(bpy.context, mph.Recipe({}), "sum")
+        backprojections.backproject_job(bpy.context, mph.Recipe({}), "sum")

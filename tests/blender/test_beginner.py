@@ -247,12 +247,12 @@ def test_what_is_proposed_leads_to_a_score(scene, small_workbook):
     settings.width = settings.height = reconstruction.voxels = 12
     reconstruction.method = "SIRT"  # without a window, what is chosen by the run is the default
     assert [press(), press(), press()] == ["Add Phantom", "Render Projections", "Reconstruct"]
-    assert "NRMSE" in {name for name, _ in reconstruction.known["scores"]}
+    assert "NRMSE" in {name for name, _ in reconstruction.details["scores"]}
     assert next_step.next_step(bpy.context).text == "Export Dataset"
     scanner.module(scanner.active_scanner(scene), 3).location.x += 1.0
     bpy.context.view_layer.update()
-    run = next(stage for stage in next_step.stages(bpy.context) if stage.name == "Run")
-    assert run.is_stale and run.found == "Module 03 moved"
+    run = next(stage for stage in next_step.work_stages(bpy.context) if stage.name == "Run")
+    assert run.is_stale and run.note == "Module 03 moved"
     check(drawn())
     assert [press(), press()] == ["Render Again", "Reconstruct"]
     scene.mphdrr_events.recipe = "//heart.toml"
@@ -312,7 +312,7 @@ def test_the_numbers_of_the_only_volume_are_shown_whatever_is_selected(scene, ri
     bpy.ops.mphdrr.add_points(voxels=8)
     item = bpy.context.object
     bpy.context.view_layer.objects.active = camera
-    assert volumes.meant(bpy.context) == item
+    assert volumes.panel_volume(bpy.context) == item
     assert {"MPHDRR_PT_look", "MPHDRR_PT_phantom_settings"} <= drawn(is_open=True).keys()
     with bpy.context.temp_override(object=item):  # as the panel's buttons have it
         bpy.ops.mphdrr.add_slices()

@@ -187,7 +187,7 @@ if sys.argv[2] == "more":
         def shapes(self):
             return (Sphere(radius=self.radius, activity=2.0),)
 
-    kinds.KINDS = (kinds.Kind("goose-egg", Egg, "Goose Egg", "an egg"), *kinds.KINDS[::-1])
+    kinds.KINDS = (kinds.PhantomKind("goose-egg", Egg, "Goose Egg", "an egg"), *kinds.KINDS[::-1])
     importlib.reload(importlib.import_module("mphdrr.core.runs.settings"))  # whose words are these tables'
 
 from mphdrr.addon import registration

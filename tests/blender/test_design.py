@@ -86,7 +86,7 @@ def test_moved_module_stays_aimed_and_its_length_follows(collection, roi_system)
     update()
     assert_consistent(collection)
     system = scanner.read_scanner(collection)
-    assert scanner.off_aim(collection, [camera]) == [] and camera.mphdrr_module.aimed
+    assert scanner.unaimed_numbers(collection, [camera]) == [] and camera.mphdrr_module.aimed
     assert system.centers[2, :2].tolist() == roi_system.centers[2, :2].tolist(), "x and y were not touched"
     assert system.centers[2, 2] == pytest.approx(roi_system.centers[2, 2] + 7.25, abs=1e-5)
     b, d, side, roi = (system.pinhole_distance, system.pinhole_diameter, system.detector_side, system.roi_radius)
@@ -155,7 +155,7 @@ def test_turning_is_left_to_the_user_and_moving_aims_again(collection):
     assert camera.rotation_euler == turned and not camera.mphdrr_module.aimed
     camera.location.z += 1.0
     update()
-    assert camera.mphdrr_module.aimed and scanner.off_aim(collection, [camera]) == []
+    assert camera.mphdrr_module.aimed and scanner.unaimed_numbers(collection, [camera]) == []
     collection.mphdrr_scanner.keep_aimed = False
     rotation = camera.rotation_euler.copy()
     camera.location.z += 1.0
@@ -185,7 +185,7 @@ def test_hidden_parented_and_animated_modules(scene, collection):
     bench.location = (3.0, -2.0, 11.0)
     bench.rotation_euler.z = 0.4
     update()
-    assert scanner.off_aim(collection, scanner.modules(collection)) == []
+    assert scanner.unaimed_numbers(collection, scanner.modules(collection)) == []
     assert_consistent(collection)
 
     animated = scanner.module(collection, 6)
@@ -369,7 +369,9 @@ def test_duplicates_stand_along_the_ring(collection, roi_system):
     with pytest.raises(RuntimeError, match="place of another module"):
         bpy.ops.mphdrr.duplicate_modules(count=1, angle=0.0)
 
-    made = module_edits.duplicate(collection, [scanner.module(collection, 1)], 1, np.radians(30.0), follow_ring=True)
+    made = module_edits.duplicate_modules(
+        collection, [scanner.module(collection, 1)], 1, np.radians(30.0), follow_ring=True
+    )
     x, y, z = scanner.read_module(collection, made[0]).centers[0]
     radii = np.hypot(*roi_system.centers[:2, :2].T)
     assert min(radii) < np.hypot(x, y) < max(radii) and z == pytest.approx(-30.0)

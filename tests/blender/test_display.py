@@ -198,7 +198,7 @@ def test_planes_of_the_active_module_its_ring_or_all_that_are_visible(projected,
 def test_planes_go_with_their_modules(projected, scene):
     projected()
     collection = scanner.active_scanner(scene)
-    module_edits.remove(collection, [scanner.module(collection, 1)])
+    module_edits.remove_modules(collection, [scanner.module(collection, 1)])
     assert [plane.mphdrr_module.number for plane in planes.planes(scene)] == [2, 3, 4, 5, 6, 7, 8]
     assert ids.picture_name(images.projection_name(1, range(8))) in bpy.data.images, "the run's pictures stay"
     bpy.data.objects.remove(scanner.module(collection, 5))  # as X does
@@ -259,7 +259,7 @@ def test_planes_of_another_scene_never_show_this_ones_run(projected, scene, ring
     volumes.add_volume(Volume(np.ones((2, 2, 2), np.float32), Grid.centered(2, 2.0)), "Other Point")
     assert bpy.ops.mphdrr.render_projections(width=8, height=8) == {"FINISHED"}
     assert len(planes.planes(other)) == 8 and not planes.planes(scene)
-    assert images.is_of(other) and not images.is_of(scene)
+    assert images.belong_to(other) and not images.belong_to(scene)
     assert not any(c.data.background_images for c in scanner.modules(scanner.active_scanner(scene)))
     assert rendering.remove_run(scene, 0) and ids.MOSAIC in bpy.data.images, "the images are not of this run"
 
@@ -278,7 +278,9 @@ def shows(display: Display) -> bool:
 
 def test_the_newest_display_wins_and_no_earlier_run_is_painted(projected, scene, monkeypatch):
     projected()
-    monkeypatch.setitem(updates.FUNCTIONS, "display", lambda *_: setattr(recoloring, "_asked", True))  # as in a window
+    monkeypatch.setitem(
+        updates.FUNCTIONS, "display", lambda *_: setattr(recoloring, "_is_requested", True)
+    )  # as in a window
     scene.mphdrr_display.colors = "GREY"
     steps = recoloring.recoloring()
     next(steps)  # numbers are being read

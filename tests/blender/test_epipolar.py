@@ -44,10 +44,10 @@ def test_the_marker_at_a_points_k_is_where_the_modules_see_the_point(projected, 
     run = projected(detector=detector, magnification=7.0, width=360, height=240)
     column, row, k = seen_from(run, 3, POINT).tolist()
     assert bpy.ops.mphdrr.pick_pixel(module=3, column=column, row=row, k=k) == {"FINISHED"}
-    found = epipolar.picked(scene)
+    found = epipolar.picked_pixel(scene)
     np.testing.assert_allclose(found.marker, POINT, atol=1e-4)
     assert found.seen_by == 8 and found.depth == pytest.approx(np.linalg.norm(POINT - found.ray[0]), rel=0.1)
-    for number, place in zip(run.numbers, found.places, strict=True):
+    for number, place in zip(run.numbers, found.marker_pixels, strict=True):
         exact = images.projection_array(bpy.data.images[ids.projection_name(number, 8)]).astype(float)
         rows, columns = np.indices(exact.shape)
         centre = np.array([(exact * columns).sum(), (exact * rows).sum()]) / exact.sum()
@@ -58,7 +58,7 @@ def test_lines_lead_through_all_that_the_ray_shows_and_the_slider_along_it(proje
     run = projected()
     bpy.ops.mphdrr.pick_pixel(module=6, column=40.25, row=31.5)
     settings, last = scene.mphdrr_epipolar, None
-    at_isocentre = epipolar.picked(scene)
+    at_isocentre = epipolar.picked_pixel(scene)
     axis = at_isocentre.marker - at_isocentre.run.views.sources[5]
     middle = run.views.sources[5] / np.linalg.norm(run.views.sources[5])
     assert axis @ -middle == pytest.approx(np.linalg.norm(run.views.sources[5]), rel=1e-6), "at the isocentre's depth"
@@ -66,15 +66,15 @@ def test_lines_lead_through_all_that_the_ray_shows_and_the_slider_along_it(proje
     for along, depth in ((0.0, -radius), (0.3, None), (1.0, radius)):
         settings.along = along
         assert settings.along == pytest.approx(along, abs=1e-5)
-        found = epipolar.picked(scene)
+        found = epipolar.picked_pixel(scene)
         if depth is not None:
             assert found.marker @ middle == pytest.approx(-depth, abs=1e-2)
-        assert found.places[5].tolist() == [40.25, 31.5]
-        others = np.isfinite(found.places).all(axis=1)
+        assert found.marker_pixels[5].tolist() == [40.25, 31.5]
+        others = np.isfinite(found.marker_pixels).all(axis=1)
         others[5] = False
         assert others.sum() > 4 and found.seen_by == others.sum() + 1
         first, end = found.lines[others].swapaxes(0, 1)
-        place, way = found.places[others], end - first
+        place, way = found.marker_pixels[others], end - first
         off = np.cross(np.pad(place - first, ((0, 0), (0, 1))), np.pad(way, ((0, 0), (0, 1))))[:, 2]
         assert np.abs(off / np.linalg.norm(way, axis=1)).max() < 1e-9, "every epipolar line holds the marker's image"
         ends = lines[others][:, int(along)]
@@ -82,15 +82,15 @@ def test_lines_lead_through_all_that_the_ray_shows_and_the_slider_along_it(proje
             whole = (np.abs(ends - place) < 1e-2).all(axis=1)
             assert whole.any(), "the bright part of the line is that of the ROI's depths"
         if last is not None:
-            assert (np.linalg.norm(found.places[others] - last[others], axis=1) > 0.1).all(), "all images move"
-        last = found.places
-    np.testing.assert_array_equal(epipolar.picked(scene).lines, at_isocentre.lines)
+            assert (np.linalg.norm(found.marker_pixels[others] - last[others], axis=1) > 0.1).all(), "all images move"
+        last = found.marker_pixels
+    np.testing.assert_array_equal(epipolar.picked_pixel(scene).lines, at_isocentre.lines)
 
 
 def test_epipoles_are_where_pinholes_are_seen(projected, scene):
     run = projected()
     bpy.ops.mphdrr.pick_pixel(module=1, column=40, row=20)
-    found = epipolar.picked(scene)
+    found = epipolar.picked_pixel(scene)
     inside = np.isfinite(found.epipoles).all(axis=1)
     for i, number in enumerate(run.numbers):
         if i == 0:
@@ -114,12 +114,15 @@ def test_what_is_impossible_is_refused_in_a_line(projected, scene):
     ):
         with pytest.raises(RuntimeError, match=said):
             bpy.ops.mphdrr.pick_pixel(**wrong)
-        assert epipolar.picked(scene) is None
+        assert epipolar.picked_pixel(scene) is None
     bpy.ops.mphdrr.pick_pixel(module=1, column=3, row=4)
     scene.mphdrr_epipolar.row = 61
-    assert epipolar.shown(scene) == (None, "column 3, row 61: the images have columns 0 to 89 and rows 0 to 59")
+    assert epipolar.picked_or_problem(scene) == (
+        None,
+        "column 3, row 61: the images have columns 0 to 89 and rows 0 to 59",
+    )
     scene.mphdrr_epipolar.row, scene.mphdrr_epipolar.module = 5, 2
-    assert epipolar.picked(scene).index == 1
+    assert epipolar.picked_pixel(scene).index == 1
     del bpy.data.images[ids.MOSAIC]["mphdrr_views"]
     epipolar._runs.clear()
     with pytest.raises(RuntimeError, match="kept by an earlier version"):
@@ -130,23 +133,23 @@ def test_a_pixel_stays_picked_while_runs_have_its_views(projected, scene, tmp_pa
     projected()
     bpy.ops.mphdrr.pick_pixel(module=2, column=33.3, row=21)
     scene.mphdrr_epipolar.along = 0.25
-    before = epipolar.picked(scene)
+    before = epipolar.picked_pixel(scene)
     projected()
-    again = epipolar.picked(scene)
+    again = epipolar.picked_pixel(scene)
     assert again.pixel.tolist() == [33.3, 21] and again.k == before.k, "other numbers of the same views"
     projected(width=50)
-    assert epipolar.picked(scene) is None and scene.mphdrr_epipolar.along == 0, "pixels of other views"
+    assert epipolar.picked_pixel(scene) is None and scene.mphdrr_epipolar.along == 0, "pixels of other views"
     bpy.ops.mphdrr.show_run(index=0)
-    assert epipolar.picked(scene).marker.tolist() == before.marker.tolist()
+    assert epipolar.picked_pixel(scene).marker.tolist() == before.marker.tolist()
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "kept.blend"))
     bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "kept.blend"))
     scene = bpy.context.scene
-    assert epipolar.picked(scene).marker.tolist() == before.marker.tolist(), "saved"
-    assert bpy.ops.mphdrr.clear_pixel() == {"FINISHED"} and epipolar.picked(scene) is None
+    assert epipolar.picked_pixel(scene).marker.tolist() == before.marker.tolist(), "saved"
+    assert bpy.ops.mphdrr.clear_pixel() == {"FINISHED"} and epipolar.picked_pixel(scene) is None
     bpy.ops.mphdrr.pick_pixel(module=2, column=33.3, row=21)
     while scene.mphdrr_projections.runs:
         bpy.ops.mphdrr.remove_run(index=0)
-    assert epipolar.picked(scene) is None and epipolar.run_views(scene) is None
+    assert epipolar.picked_pixel(scene) is None and epipolar.run_views(scene) is None
 
 
 def test_picking_is_undone_and_done_again(projected, scene):
@@ -158,7 +161,7 @@ def test_picking_is_undone_and_done_again(projected, scene):
         bpy.ops.ed.undo_push(message="Pick")
 
     def pixel():
-        found = epipolar.picked(bpy.context.scene)
+        found = epipolar.picked_pixel(bpy.context.scene)
         return None if found is None else (found.run.numbers[found.index], *found.pixel.tolist())
 
     assert pixel() == (5, 15, 20)
@@ -180,17 +183,17 @@ def test_pixels_and_places_in_pictures_are_one_to_one(projected, scene, half, de
     shape = run.views.shape
     rng = np.random.default_rng(5)
     for image in (bpy.data.images[name] for name in (ids.MOSAIC, "mphDRR 07", "mphDRR 07 picture")):
-        shown = tiles.pictures(image)
+        shown = tiles.shown_pictures(image)
         assert [picture.number for picture in shown] == (run.numbers if image.name == ids.MOSAIC else [7])
         for picture in shown:
             share = 0.25 if picture.half else 0.0
             within = rng.uniform(share + 0.02, 0.98 - share, (5, 2)) * [pixels[0], pixels[1]] - 0.5
-            places = picture.places(within, shape)
-            np.testing.assert_allclose(picture.pixels(places, shape), within, atol=1e-9)
+            places = picture.image_positions(within, shape)
+            np.testing.assert_allclose(picture.projection_pixels(places, shape), within, atol=1e-9)
             width, height = image.size
             for (down, right), (column, row) in zip(places, within, strict=True):
                 found, place = tiles.picture_at(image, right / width, 1 - down / height)
-                assert found == picture and picture.pixel(place, shape) == (round(column), round(row))
+                assert found == picture and picture.pixel_at(place, shape) == (round(column), round(row))
 
 
 @pytest.mark.parametrize(("half", "detector"), [(False, "VIRTUAL"), (True, "REAL")])
@@ -216,17 +219,17 @@ def test_lines_on_planes_are_on_the_lines_of_sight_to_the_ray(projected, scene):
     """Seen from its pinhole, what is drawn on a module's plane covers what it is the image of."""
     run = projected()
     bpy.ops.mphdrr.pick_pixel(module=8, column=37, row=30)
-    found = epipolar.picked(scene)
+    found = epipolar.picked_pixel(scene)
     view = type("View", (), {"is_perspective": True, "view_matrix": Matrix.Identity(4)})
     context = type("Context", (), {"scene": scene, "region_data": view, "view_layer": bpy.context.view_layer})
-    _, (roi, _, _), _, (rings, _, _), (square, _, _) = epipolar_drawing._on_planes(context, found)
+    _, (roi, _, _), _, (rings, _, _), (square, _, _) = epipolar_drawing._plane_segments(context, found)
     shown = [plane.mphdrr_module.number for plane in planes.planes(scene)]
     others = [number for number in shown if number != 8]
     assert len(square) == 4
     for number, ends, ring in zip(others, roi.reshape(7, 4, 3), rings.reshape(7, 24, 2, 3), strict=True):
         i = run.numbers.index(number)
         drawn = epipolar.project_points(run.views, ends[np.isfinite(ends).all(axis=1)])[i]
-        place, line = found.places[i], found.lines_in_roi[i]
+        place, line = found.marker_pixels[i], found.lines_in_roi[i]
         radius = np.linalg.norm(epipolar.project_points(run.views, ring.reshape(-1, 3))[i] - place, axis=1)
         at_end = np.abs(drawn[:, None] - line).max(axis=2).min(axis=1) < 1e-3  # so on the same line of sight
         at_circle = np.isclose(np.linalg.norm(drawn - place, axis=1), 0.05 * 90, rtol=0.01)
@@ -245,7 +248,7 @@ def test_a_line_is_open_where_the_marker_is(scene):
         (nothing, nothing),
         (nothing, [(1.6, 1.2), (8, 6)]),
     ]
-    np.testing.assert_allclose(epipolar_drawing._open_at(ends, places, 2.0), np.array(expected), atol=1e-12)
+    np.testing.assert_allclose(epipolar_drawing._cut_at(ends, places, 2.0), np.array(expected), atol=1e-12)
 
 
 def test_a_run_of_another_scene_has_no_lines_here(projected, scene):
@@ -253,6 +256,6 @@ def test_a_run_of_another_scene_has_no_lines_here(projected, scene):
     bpy.ops.mphdrr.pick_pixel(module=2, column=33, row=21)
     other = bpy.data.scenes.new("Other")
     other.mphdrr_epipolar.views = scene.mphdrr_epipolar.views
-    assert epipolar.picked(other) is None and epipolar.picked(scene) is not None
+    assert epipolar.picked_pixel(other) is None and epipolar.picked_pixel(scene) is not None
     with pytest.raises(InputError, match="of another scene"):
-        epipolar.pick(other, 2, 33, 21)
+        epipolar.pick_pixel(other, 2, 33, 21)

@@ -96,7 +96,7 @@ def test_the_phantom_in_the_scene_becomes_that_of_the_event(recipe, scene, mirro
     planned = first_of(recipe, "derenzo", mirrored)
     assert bpy.ops.mphdrr.try_event(number=planned.number) == {"FINISHED"}
     item = only_phantom()
-    made = phantoms.recipe_of(phantoms.settings_of(item)).phantom
+    made = phantoms.copy_settings(phantoms.settings_of(item)).phantom
     assert made.altered == planned.phantom.altered == -2
     assert made.radius == pytest.approx(planned.phantom.radius, rel=1e-6)
     np.testing.assert_allclose(made.rod_diameters, planned.phantom.rod_diameters, rtol=1e-6)
@@ -171,7 +171,7 @@ def test_a_file_of_the_recipe_is_tried_too(recipe, scene, tmp_path):
 def test_a_set_is_that_of_the_library_and_goes_on_after_cancel(recipe, scene, tmp_path):
     events.make(recipe, tmp_path / "expected", 2)
     folder = scene.mphdrr_events.folder
-    job = event_sets.making(str(tmp_path / "small.toml"), folder, 2)
+    job = event_sets.make_set_job(str(tmp_path / "small.toml"), folder, 2)
 
     def progress(done: int, total: int) -> None:
         if done == 1:
@@ -179,14 +179,14 @@ def test_a_set_is_that_of_the_library_and_goes_on_after_cancel(recipe, scene, tm
 
     with pytest.raises(Cancelled):
         jobs.run(job, progress)
-    assert job.left() == "1 event made now and kept; Make Event Set goes on from there"
+    assert job.leftovers() == "1 event made now and kept; Make Event Set goes on from there"
     first = Path(folder, "events", "000000.h5")
     assert [path.name for path in first.parent.iterdir()] == [first.name]
     written = first.stat().st_mtime_ns
     assert bpy.ops.mphdrr.make_event_set() == {"FINISHED"}
     assert first.stat().st_mtime_ns == written
     assert files(Path(folder)) == files(tmp_path / "expected")
-    assert jobs.run(event_sets.making("", folder, 2)).startswith("All events asked for are there already: 2 in ")
+    assert jobs.run(event_sets.make_set_job("", folder, 2)).startswith("All events asked for are there already: 2 in ")
 
 
 def test_an_event_is_opened_with_truth_phantom_and_projections(recipe, scene, tmp_path):
@@ -204,7 +204,7 @@ def test_an_event_is_opened_with_truth_phantom_and_projections(recipe, scene, tm
     assert phantom == settings.phantom and not phantom.visible_get()
     np.testing.assert_allclose(volumes.pose_of_object(phantom), event.placement, atol=1e-12)
     assert phantoms.settings_of(phantom).radius == pytest.approx(event.settings["radius"], rel=1e-6)
-    item = runs.shown(scene)
+    item = runs.shown_run(scene)
     np.testing.assert_array_equal(read_run(storage.absolute(item.file)).projections, event.images("lines"))
     assert item.name == f"Event {number} derenzo, lines" and runs.changes(scene) == []
     assert len(scanner.modules(scanner.active_scanner(scene))) == 4, "the set's, since the scene had none"
@@ -274,7 +274,7 @@ def test_the_next_event_takes_the_place_of_the_one_before(recipe, scene, tmp_pat
     first, objects = scene.mphdrr_events.truth, set(bpy.data.objects)
     bpy.ops.mphdrr.open_event(opened=2, model="counts")
     assert set(bpy.data.objects) == objects and scene.mphdrr_events.truth == first
-    assert first.name.startswith("Event 2 ") and runs.shown(scene).name.endswith(", counts")
+    assert first.name.startswith("Event 2 ") and runs.shown_run(scene).name.endswith(", counts")
     bpy.ops.mphdrr.try_event(number=1)
     assert only_phantom().visible_get() and not first.visible_get()
     bpy.data.objects.remove(first)
@@ -299,18 +299,18 @@ def test_what_is_wrong_is_said_in_a_line(recipe, scene, tmp_path):
 
 def test_notes_say_what_a_recipe_and_a_set_are(recipe, scene, tmp_path):
     settings = scene.mphdrr_events
-    note = event_notes.of_recipe(settings.recipe)
+    note = event_notes.recipe_note(settings.recipe)
     assert (note.text, note.is_wrong) == ("derenzo, defrise; lines, counts; 16³ voxels of 6 mm", False)
-    assert event_notes.of_recipe("") is None and event_notes.of_set(settings.folder) is None
+    assert event_notes.recipe_note("") is None and event_notes.set_note(settings.folder) is None
     events.make(recipe, tmp_path / "set", 2)
     (tmp_path / "set/events/000001.h5").unlink()
-    note = event_notes.of_set(settings.folder)
+    note = event_notes.set_note(settings.folder)
     assert note.text.startswith("1 of 2 events, ") and note.models == ("lines", "counts")
     Path(settings.recipe).write_text(TEXT.replace("radius =", "radios ="))
-    note = event_notes.of_recipe(settings.recipe)
+    note = event_notes.recipe_note(settings.recipe)
     assert note.is_wrong and note.text.startswith("phantoms: derenzo: radios: no such setting")
     Path(settings.recipe).write_text(TEXT.replace(str(WORKBOOK), "gone.xlsx"))
-    assert "gone.xlsx: no such file" in event_notes.of_recipe(settings.recipe).text
+    assert "gone.xlsx: no such file" in event_notes.recipe_note(settings.recipe).text
 
 
 @pytest.mark.parametrize("like", TEMPLATES)

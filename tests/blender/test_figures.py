@@ -135,7 +135,7 @@ def test_figures_refuse_what_is_not_there(scene, dc_spect, tmp_path):
 def test_pixels_of_a_rendered_picture_are_read_exactly(scene, tmp_path):
     page = Page(250, 240, "#1380ff")
     page.write(tmp_path / "page.png")
-    assert np.array_equal(engine.pixels(tmp_path / "page.png"), page.picture)
+    assert np.array_equal(engine.read_pixels(tmp_path / "page.png"), page.picture)
     assert "page.png" not in bpy.data.images
 
 
@@ -160,7 +160,7 @@ def test_a_picture_that_a_volume_does_not_change_is_warned_of(example, tmp_path,
         picture[height // 3 : height // 2, width // 3 : width // 2] += np.uint8(len(shown) * changes)
         return picture
 
-    monkeypatch.setattr(figures, "_render", render)
+    monkeypatch.setattr(figures, "_render_pixels", render)
     for kind in ("cut-away", "inside"):
         sizes.clear()
         job = figures.figure_job(bpy.context, kind, [path], (640, 480), samples=1)
@@ -210,7 +210,7 @@ def small_render(example):
 
 def test_render_says_which_volumes_of_the_view_it_lacks(small_render, capfd, monkeypatch):
     (item,) = volumes.volume_objects(small_render)
-    monkeypatch.setattr(figures, "drawing", lambda *_: iter(()))  # whose own tests are above
+    monkeypatch.setattr(figures, "draw_figure", lambda *_: iter(()))  # whose own tests are above
     assert rendered(small_render, capfd) == ""
     item.hide_render = True
     assert (
@@ -230,7 +230,7 @@ def test_render_says_which_volumes_of_the_view_it_lacks(small_render, capfd, mon
     bpy.context.view_layer.update()
     assert rendered(small_render, capfd) == ""
     volumes.file_of(item).unlink()
-    storage._size_at.cache_clear()
+    storage._cached_size.cache_clear()
     assert rendered(small_render, capfd).endswith(f"nothing of {item.name!r}: its files are missing")
 
 
@@ -245,9 +245,9 @@ def test_render_says_what_cycles_does_not_draw(small_render, capfd, has_scanner)
         small_render.collection.children.unlink(scanner.active_scanner(small_render))
         item.location = (250.0, -300.0, 120.0)
         bpy.context.view_layer.update()
-    figures._drawn.clear()
+    figures._known_visible.clear()
     assert rendered(small_render, capfd) == ""
-    assert figures._drawn, "it was tried"
+    assert figures._known_visible, "it was tried"
     item.mphdrr_volume.display_high = 9e9
     item.mphdrr_volume.display_low = 8e9
     assert "Low and High draw none of its values" in rendered(small_render, capfd)

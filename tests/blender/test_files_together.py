@@ -50,7 +50,7 @@ def held() -> dict[str, np.ndarray]:
     found = {
         f"{item.name} {k}": volumes.reader(item, path)().array
         for item in volumes.volume_objects(scene)
-        for k, path in enumerate(storage.files_of_states(item.data))
+        for k, path in enumerate(storage.state_files(item.data))
     }
     found |= {run.name: read_run(storage.absolute(run.file)).projections for run in scene.mphdrr_projections.runs}
     return found
@@ -60,12 +60,12 @@ def is_whole(top: Path, expected: dict[str, np.ndarray]) -> None:
     """Whether the scene's files are below a folder, and hold what they did."""
     assert storage.missing_volumes() == []
     assert all(item.data.grids.load() for item in volumes.volume_objects(bpy.context.scene))
-    named = [storage.absolute(getattr(owner, name)).resolve() for owner, name in storage.references()]
+    named = [storage.absolute(getattr(owner, name)).resolve() for owner, name in storage.file_references()]
     outside = [path for path in named if not path.is_relative_to(top) and path.is_file()]
     assert [path for path in outside if path.suffix != ".xlsx"] == []
     now = held()
     assert now.keys() == expected.keys() and all(np.array_equal(now[name], expected[name]) for name in now)
-    assert runs.shown(bpy.context.scene) is not None
+    assert runs.shown_run(bpy.context.scene) is not None
 
 
 def test_save_as_makes_a_pair_of_its_own_that_opens_elsewhere(study, tmp_path, capfd):
@@ -93,11 +93,11 @@ def test_save_as_makes_a_pair_of_its_own_that_opens_elsewhere(study, tmp_path, c
 
 @pytest.mark.parametrize("remapped", [True, False])
 def test_a_copy_is_whole_and_leaves_the_session_as_it_was(study, tmp_path, remapped):
-    expected, paths = held(), [getattr(owner, name) for owner, name in storage.references()]
+    expected, paths = held(), [getattr(owner, name) for owner, name in storage.file_references()]
     copy = tmp_path / "b" / "copy.blend"
     copy.parent.mkdir()
     bpy.ops.wm.save_as_mainfile(filepath=str(copy), copy=True, relative_remap=remapped)
-    assert [getattr(owner, name) for owner, name in storage.references()] == paths
+    assert [getattr(owner, name) for owner, name in storage.file_references()] == paths
     is_whole(study.parent, expected)
     bpy.ops.wm.open_mainfile(filepath=str(copy))
     is_whole(copy.parent, expected)

@@ -98,7 +98,9 @@ def test_layers_stand_on_the_rays_of_their_pixels_and_show_their_means(shown, sc
         picture = layer.data
         assert picture.size[:] == SHAPE[::-1] and picture.packed_file is not None
         pixels = np.rint(255 * np.reshape(picture.pixels[:], (*SHAPE, 4)))[::-1][turned, turned]
-        np.testing.assert_array_equal(pixels, frustums.colored(as_seen(means[..., plane].T), "activity", low, high))
+        np.testing.assert_array_equal(
+            pixels, frustums.color_values(as_seen(means[..., plane].T), "activity", low, high)
+        )
     # Seen from the pinhole, layers lie on one another: corners are on rays, and magnification makes them as large.
     rays = np.array([corners(layer).reshape(-1, 3) - source for layer in layers])
     rays /= np.linalg.norm(rays, axis=2, keepdims=True)
@@ -112,21 +114,21 @@ def test_layers_stand_on_the_rays_of_their_pixels_and_show_their_means(shown, sc
 
 def test_what_is_low_is_transparent_and_colours_are_those_of_slices():
     values = np.array([-1.0, 0.0, 0.5, 1.0, 3.0], np.float32)
-    found = frustums.colored(values, "activity", 0.0, 1.0)
+    found = frustums.color_values(values, "activity", 0.0, 1.0)
     assert found[:, 3].tolist() == [0, 0, 180, 255, 255]
-    np.testing.assert_array_equal(found[3, :3], np.rint(255 * slices.colors("activity")[-1, :3]))
+    np.testing.assert_array_equal(found[3, :3], np.rint(255 * slices.color_table("activity")[-1, :3]))
 
 
 def test_ct_numbers_are_air_outside_their_grid(ring_system):
     grid = mph.Grid.centered((9, 8, 7), 6.0)
     values = np.random.default_rng(3).uniform(-1000, 800, grid.shape).astype(np.float32)
     g = grid_of_volume(grid, ring_system)
-    found = frustums.in_perspective(mph.Volume(values, grid, "hu"), g)
+    found = frustums.to_module_cells(mph.Volume(values, grid, "hu"), g)
     np.testing.assert_allclose(found, mph.to_perspective(values + 1000, g, grid=grid) - 1000, atol=1e-3)
-    back = frustums.on_voxels(found, g, mph.Volume(values, grid, "hu"))
+    back = frustums.to_voxels(found, g, mph.Volume(values, grid, "hu"))
     assert back.quantity == "hu" and back.array.min() >= -1000.01
-    air = frustums.in_perspective(mph.Volume(np.full(grid.shape, -1000, np.float32), grid, "hu"), g)
-    assert np.all(air == -1000) and np.all(frustums.on_voxels(air, g, mph.Volume(values, grid, "hu")).array == -1000)
+    air = frustums.to_module_cells(mph.Volume(np.full(grid.shape, -1000, np.float32), grid, "hu"), g)
+    assert np.all(air == -1000) and np.all(frustums.to_voxels(air, g, mph.Volume(values, grid, "hu")).array == -1000)
 
 
 def grid_of_volume(grid: mph.Grid, system) -> mph.PerspectiveGrid:
@@ -153,9 +155,9 @@ def test_it_goes_with_its_module_and_says_what_is_not_true_any_more(shown, scene
     scene.mphdrr_projections.width = 30
     assert "other pixels" in frustums.changes(scene, frustum)
     scene.mphdrr_projections.width = SHAPE[1]
-    assert frustums.seen_volumes(scene) == [shown]  # whose colour bar is drawn
+    assert frustums.visible_volumes(scene) == [shown]  # whose colour bar is drawn
     shown.mphdrr_volume.display_high *= 0.5
-    assert frustums.seen_volumes(scene) == []
+    assert frustums.visible_volumes(scene) == []
     assert frustums.changes(scene, frustum) == "other colours of Derenzo"
     shown.location.x += 4.0
     bpy.context.view_layer.update()
@@ -210,7 +212,7 @@ def test_it_is_hidden_and_removed_with_its_module(shown, scene):
     bpy.context.view_layer.update()
     assert not frustum.hide_viewport and not any(layer.hide_viewport for layer in frustum.children)
     camera = frustum.parent
-    module_edits.remove(scanner.active_scanner(scene), [camera])
+    module_edits.remove_modules(scanner.active_scanner(scene), [camera])
     assert frustums.frustums(scene) == [] and names()[2] == before[2]
     choose(4)
     bpy.ops.mphdrr.show_in_perspective(planes=2)
@@ -258,7 +260,7 @@ def test_cancelled_it_leaves_everything_as_it_was(shown, scene):
         if total > 1:
             raise Cancelled
 
-    for job in (frustums.showing(bpy.context, 4, "K"), frustums.resampling(bpy.context, 8, "K")):
+    for job in (frustums.frustum_job(bpy.context, 4, "K"), frustums.resample_job(bpy.context, 8, "K")):
         with pytest.raises(Cancelled):
             jobs.run(job, progress)
     assert names() == before and sorted(storage.folder().iterdir()) == files
@@ -301,4 +303,4 @@ def test_back_on_voxels_it_is_what_the_modules_cells_keep(shown, scene, ring_sys
     np.testing.assert_allclose(found.array, expected, atol=1e-5 * expected.max())
     np.testing.assert_allclose(objects.world_matrix(item), objects.world_matrix(shown), atol=1e-6)
     bpy.ops.mphdrr.show_in_perspective(planes=2)
-    assert frustums.volume_of(frustums.frustums(scene)[0]) == item.name
+    assert frustums.volume_name(frustums.frustums(scene)[0]) == item.name

@@ -12,7 +12,7 @@ import pytest
 
 from mphdrr.addon.blender import jobs
 from mphdrr.addon.scanner import module_edits, scanner
-from mphdrr.addon.scanner.scanner_files import exporting_scanner
+from mphdrr.addon.scanner.scanner_files import export_workbook_job
 from mphdrr.core.errors import InputError, InputWarning
 from mphdrr.core.geometry.system import LENGTHS
 from mphdrr.core.workbook import read_system
@@ -59,9 +59,9 @@ def random_edits(rng: np.random.Generator, collection: bpy.types.Collection) -> 
             case 3:
                 module.collimator_length = rng.uniform(40.0, 90.0)
             case 4:
-                module_edits.duplicate(collection, [camera], 1, rng.uniform(0.01, 0.03), bool(rng.integers(2)))
+                module_edits.duplicate_modules(collection, [camera], 1, rng.uniform(0.01, 0.03), bool(rng.integers(2)))
             case 5:
-                module_edits.remove(collection, [camera])
+                module_edits.remove_modules(collection, [camera])
             case 6:
                 module.detector_side, module.detector_thickness = rng.uniform(40.0, 60.0), rng.uniform(5.0, 12.0)
         bpy.context.view_layer.update()
@@ -86,8 +86,8 @@ def test_random_edits_come_back_from_the_workbook(scene, collection, tmp_path, s
 
 
 def test_modules_keep_the_order_of_the_workbook_and_added_ones_come_last(collection, tmp_path):
-    module_edits.duplicate(collection, [scanner.module(collection, 5)], 1, 0.02, follow_ring=False)
-    module_edits.remove(collection, [scanner.module(collection, 2)])
+    module_edits.duplicate_modules(collection, [scanner.module(collection, 5)], 1, 0.02, follow_ring=False)
+    module_edits.remove_modules(collection, [scanner.module(collection, 2)])
     bpy.ops.mphdrr.export_geometry(filepath=str(tmp_path / "a.xlsx"))
     assert read_system(tmp_path / "a.xlsx").numbers.tolist() == [1, *range(3, 18)]
     assert not scanner.module(collection, 17).mphdrr_module.added
@@ -118,7 +118,7 @@ def test_template_that_has_gone_is_said(collection, own, tmp_path):
     scanner.module(collection, 3).mphdrr_module.pinhole_diameter = 2.9
     system = scanner.read_scanner(collection)
     with pytest.warns(InputWarning, match=r"own\.xlsx has gone"):
-        jobs.run(exporting_scanner(collection, tmp_path / "new.xlsx"))
+        jobs.run(export_workbook_job(collection, tmp_path / "new.xlsx"))
     assert_equal(read_system(tmp_path / "new.xlsx"), system)
 
 

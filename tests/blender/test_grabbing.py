@@ -50,7 +50,7 @@ def test_the_module_goes_where_a_part_is_put(collection, name):
     collection.mphdrr_scanner.keep_aimed = True
     item.location.z += 2.0
     bpy.context.view_layer.update()
-    assert camera.mphdrr_module.aimed and scanner.off_aim(collection, [camera]) == []
+    assert camera.mphdrr_module.aimed and scanner.unaimed_numbers(collection, [camera]) == []
 
 
 def test_a_drag_goes_from_where_it_began(collection, monkeypatch):

@@ -120,7 +120,7 @@ def test_slices_show_the_voxels_where_they_are(ct):
     index = (9, 4, 2)
     item.mphdrr_volume.slices = index
     bpy.context.view_layer.update()
-    shades = slices.colors("hu")
+    shades = slices.color_table("hu")
     for axis, plane in enumerate(planes):
         values = np.take(ct.array, index[axis], axis).T
         expected = shades[((values + 1000.0) * (255 / 2500.0)).astype(int)]

@@ -26,7 +26,9 @@ from mphdrr.core.volumes.volume_files import write_volume
 def scanned(scene, ring_system):
     """A scanner, a phantom that is active, and a run of its projections."""
     scanner.build_scanner(scene, ring_system, "Ring")
-    jobs.run(phantoms.adding(plain_settings("derenzo", voxels=16, rod_diameters=(10, 8, 0, 0, 0, 0)), "Derenzo"))
+    jobs.run(
+        phantoms.add_phantom_job(plain_settings("derenzo", voxels=16, rod_diameters=(10, 8, 0, 0, 0, 0)), "Derenzo")
+    )
     bpy.ops.mphdrr.render_projections(width=10, height=12)
 
 
@@ -75,24 +77,24 @@ def projecting(tmp_path):
 
 
 def adding(tmp_path):
-    return phantoms.adding(plain_settings("jaszczak", voxels=16, **TANK), "Body", attenuation=True)
+    return phantoms.add_phantom_job(plain_settings("jaszczak", voxels=16, **TANK), "Body", attenuation=True)
 
 
 def updating(tmp_path):
-    return phantoms.updating(bpy.data.objects["Derenzo"])
+    return phantoms.update_phantom_job(bpy.data.objects["Derenzo"])
 
 
 def importing(tmp_path):
     write_volume(Volume(np.ones((3, 4, 5)), Grid.centered((3, 4, 5), 2.0), "hu"), tmp_path / "ct.nii")
-    return volume_import.importing([tmp_path / "ct.nii"])
+    return volume_import.import_job([tmp_path / "ct.nii"])
 
 
 def mapping(tmp_path):
-    return maps.mapping(bpy.context.scene, "modules", 8)
+    return maps.map_job(bpy.context.scene, "modules", 8)
 
 
 def exporting(tmp_path):
-    return scanner_files.exporting_scanner(scanner.active_scanner(bpy.context.scene), tmp_path / "own.xlsx")
+    return scanner_files.export_workbook_job(scanner.active_scanner(bpy.context.scene), tmp_path / "own.xlsx")
 
 
 def loading(tmp_path):

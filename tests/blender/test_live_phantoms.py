@@ -27,12 +27,12 @@ def window(monkeypatch):
 
 
 def is_waiting() -> bool:
-    return bpy.app.timers.is_registered(live_phantoms._rested)
+    return bpy.app.timers.is_registered(live_phantoms._update_edited)
 
 
 def assert_made(item) -> None:
     """The voxels of every quantity follow from the settings and the object's pose."""
-    recipe = phantoms.recipe_of(phantoms.settings_of(item))
+    recipe = phantoms.copy_settings(phantoms.settings_of(item))
     for one in phantoms.with_children(item):
         volume = volumes.volume_from_object(one)
         assert np.array_equal(volume.array, recipe.phantom.voxelize(recipe.grid, quantity=volume.quantity).array)
@@ -60,7 +60,7 @@ def test_a_larger_one_is_made_when_its_settings_rest(item, window):
         settings.half_size = half_size
         assert item.mphdrr_volume.outdated and is_waiting()
         assert np.array_equal(volumes.volume_from_object(item).array, before.array)
-    assert live_phantoms._rested() is None
+    assert live_phantoms._update_edited() is None
     assert_made(item)
 
 
@@ -86,7 +86,7 @@ def test_what_cannot_be_made_is_said_and_not_tried_again(item, window, monkeypat
     settings.half_size = 32
     assert not item.mphdrr_volume.message and is_waiting()
     bpy.data.objects.remove(item)
-    assert live_phantoms._rested() is None
+    assert live_phantoms._update_edited() is None
 
 
 def test_an_undo_takes_back_voxels_and_settings_together(item):
@@ -102,14 +102,14 @@ def test_an_undo_takes_back_voxels_and_settings_together(item):
 
 
 def test_a_volume_that_goes_while_voxels_are_made(item):
-    stored = phantoms.remaking(item)(None)
+    stored = phantoms.make_voxelizer(item)(None)
     bpy.data.objects.remove(item.children[0])
     with pytest.raises(InputError, match="try again"):
-        phantoms.replace(item, stored)
+        phantoms.replace_voxels(item, stored)
 
 
 def test_a_setting_that_changes_while_an_update_is_made(item, window, monkeypatch):
-    remaking, settings = phantoms.remaking, item.mphdrr_volume.shepp_logan
+    remaking, settings = phantoms.make_voxelizer, item.mphdrr_volume.shepp_logan
 
     def edited_meanwhile(*arguments):
         work = remaking(*arguments)
@@ -121,7 +121,7 @@ def test_a_setting_that_changes_while_an_update_is_made(item, window, monkeypatc
 
         return working
 
-    monkeypatch.setattr(phantoms, "remaking", edited_meanwhile)
+    monkeypatch.setattr(phantoms, "make_voxelizer", edited_meanwhile)
     assert bpy.ops.mphdrr.update_phantom() == {"FINISHED"}
     assert item.mphdrr_volume.outdated and is_waiting()
     monkeypatch.undo()
@@ -130,14 +130,14 @@ def test_a_setting_that_changes_while_an_update_is_made(item, window, monkeypatc
 
 
 def test_panels_look_at_the_disk_now_and_then(item, monkeypatch):
-    monkeypatch.setattr(storage, "_LOOK", 1e9)
+    monkeypatch.setattr(storage, "_SIZE_LIFETIME", 1e9)
     path = volumes.file_of(item)
-    assert "KiB" in volumes.file_state(item) and storage.missing_volumes() == []
+    assert "KiB" in volumes.file_note(item) and storage.missing_volumes() == []
     content = path.read_bytes()
     path.unlink()
-    assert "KiB" in volumes.file_state(item) and storage.missing_volumes() == []
-    storage._size_at.cache_clear()
-    assert volumes.file_state(item) == "missing" and storage.missing_volumes() == [item.data]
+    assert "KiB" in volumes.file_note(item) and storage.missing_volumes() == []
+    storage._cached_size.cache_clear()
+    assert volumes.file_note(item) == "missing" and storage.missing_volumes() == [item.data]
     path.write_bytes(content)
-    storage._size_at.cache_clear()
-    assert "KiB" in volumes.file_state(item)
+    storage._cached_size.cache_clear()
+    assert "KiB" in volumes.file_note(item)

@@ -54,7 +54,7 @@ def test_what_lies_in_front_of_the_slices_is_cut_away_and_comes_back(nema):
     assert len(slices.planes_of(nema)) == 3
     for index in ((32, 32, 40), (20, 40, 30)):
         settings.slices = index
-        at = slices._stored(nema).grid.affine @ [*index, 1.0]
+        at = slices._read_volume(nema).grid.affine @ [*index, 1.0]
         vertices, _ = surface(nema)
         inside = ((vertices - at[:3]) * [1, -1, 1] > 5.0).all(axis=1)  # mm: a face reaches as far as a voxel
         assert len(vertices) > 1000 and not inside.any()
@@ -91,7 +91,7 @@ def test_a_look_from_the_asset_library_restyles_a_volume_and_its_slices(nema, tm
         pixels = np.array(plane.data.materials[0].node_tree.nodes["Slice"].image.pixels).reshape(-1, 4)
         return pixels[pixels[:, :3].sum(axis=1).argmax(), :3]
 
-    assert np.allclose(brightest(), slices.colors("", volume_materials.ramp_of(nema))[-1, :3], atol=0.01)
+    assert np.allclose(brightest(), slices.color_table("", volume_materials.item_ramp(nema))[-1, :3], atol=0.01)
     assert look.inputs["High"].default_value == 3.0 and brightest()[2] < brightest()[0]
     look.node_tree.nodes["Colors"].color_ramp.elements[-1].color = (1.0, 1.0, 1.0, 1.0)
     assert np.allclose(brightest(), 1.0, atol=0.01)
@@ -146,7 +146,7 @@ def test_presets_of_a_ct(scene):
 def test_slices_of_nema_show_six_spheres_also_after_reopening(nema, tmp_path):
     slices.add_slices(nema)
     nema.mphdrr_volume.display_low = 6.0  # above the background
-    at = np.linalg.inv(slices._stored(nema).grid.affine) @ [0, 0, 0, 1]  # the spheres' middles
+    at = np.linalg.inv(slices._read_volume(nema).grid.affine) @ [0, 0, 0, 1]  # the spheres' middles
     nema.mphdrr_volume.slices = np.rint(at[:3]).astype(int).tolist()
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "a.blend"))
     bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "a.blend"))
@@ -158,10 +158,10 @@ def test_slices_of_nema_show_six_spheres_also_after_reopening(nema, tmp_path):
 def test_a_plane_that_the_user_deleted_leaves_the_others_as_they_are(nema):
     first, second, _ = slices.add_slices(nema)
     bpy.data.objects.remove(first)
-    start, step = slices.way(nema, 2)
-    slices.move(nema, 1, 3)
+    start, step = slices.slice_track(nema, 2)
+    slices.move_slice(nema, 1, 3)
     assert start.length > 0 and step.length == pytest.approx(nema.mphdrr_volume.spacing[2])
-    assert second.location.length > 0 and slices.names(nema)[0] == ""
+    assert second.location.length > 0 and slices.plane_names(nema)[0] == ""
 
 
 def test_a_map_has_a_bar_in_the_unit_of_the_panels(scene, small_workbook):
@@ -170,7 +170,7 @@ def test_a_map_has_a_bar_in_the_unit_of_the_panels(scene, small_workbook):
     item = bpy.data.objects["Sensitivity map"]
     middle = 1e6 * volumes.volume_from_object(item).array[4, 4, 4]
     assert middle == pytest.approx(scene.mphdrr_geometry.scanner.mphdrr_scanner.sensitivity, rel=1e-5)
-    title, texts = color_bar.marks(item)
+    title, texts = color_bar.labels(item)
     settings = item.mphdrr_volume
     assert title == "sensitivity, cps/MBq" and float(texts[0]) <= middle <= float(texts[-1])
     assert (

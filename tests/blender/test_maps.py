@@ -64,7 +64,7 @@ def test_each_scanner_has_its_own_map_and_no_other_volume_is_replaced(collection
     of_modules = sensitivity(scanner.read_scanner(other), np.zeros((1, 3)))[0]
     assert ratio[1, 1, 1] == pytest.approx(of_modules.sum() / (of_modules.sum() - 0.75 * of_modules[0]), rel=1e-5)
     before = volumes.volume_from_object(of_first).array
-    jobs.run(maps.again(scene, of_first))  # while the other scanner is active
+    jobs.run(maps.remake_map_job(scene, of_first))  # while the other scanner is active
     assert np.array_equal(volumes.volume_from_object(of_first).array, before)
 
 

@@ -118,10 +118,10 @@ def test_one_of_other_modules_stays_beside_it(scene, recipe, found, at_once, rin
 
 def moved(scene, recipe, looks: int) -> tuple[jobs.Job, list[mph.PinholeSystem]]:
     """A job whose search is shown so many times, and the scanners that were seen."""
-    job, seen = optimising.optimizing(scene, recipe), []
+    job, seen = optimising.optimize_job(scene, recipe), []
 
     def work(done, total):
-        job.look()
+        job.refresh()
         collections = scanner.scanners(scene)
         seen.append(scanner.read_scanner(collections[-1]) if collections else None)
         if len(seen) == looks:
@@ -149,12 +149,12 @@ def test_it_moves_while_it_works_and_cancelling_takes_all_back(scene, recipe, li
 
 
 def test_finishing_early_keeps_the_best_so_far(scene, recipe):
-    job = optimising.optimizing(scene, recipe)
+    job = optimising.optimize_job(scene, recipe)
 
     def progress(done, total):
         assert done < 4
         if done == 2:
-            job.enough.set()
+            job.finish_now.set()
 
     assert "stopped after 3 steps" in jobs.run(job, progress)
     half = json.loads(scanner.active_scanner(scene).mphdrr_scanner.design)
@@ -178,7 +178,7 @@ def test_faults_are_said_and_marked(scene, recipe, tmp_path):
     path = tmp_path / "crowded.toml"
     path.write_text(TEXT.replace("[search]", "[constraints]\nbore = 250\n\n[search]"))
     with pytest.warns(mph.InputWarning, match="into the bore"):
-        text = jobs.run(optimising.optimizing(scene, path))
+        text = jobs.run(optimising.optimize_job(scene, path))
     assert "not a good scanner" in text
     assert "into the bore" in json.loads(scanner.active_scanner(scene).mphdrr_scanner.design)[-1]
 

@@ -92,7 +92,7 @@ def test_scripts_add_what_operators_add():
     arguments = {"half_size": 60.0, "voxels": 12, "contrast": "original"}
     added = add("shepp-logan", attenuation=True, **POSE, **arguments)
     settings = phantom_properties.plain_settings("shepp-logan", **arguments)
-    assert "Head" in jobs.run(phantoms.adding(settings, "Head", pose(), attenuation=True))
+    assert "Head" in jobs.run(phantoms.add_phantom_job(settings, "Head", pose(), attenuation=True))
     item = bpy.context.object
     assert phantoms.settings_of(item).values() == phantoms.settings_of(added).values()
     for one, other in zip(phantoms.with_children(item), phantoms.with_children(added), strict=True):

@@ -11,7 +11,7 @@ import mphdrr.core as mph
 from mphdrr.addon.blender import jobs
 from mphdrr.addon.cli import main
 from mphdrr.addon.figures import figures
-from mphdrr.addon.figures.stage import Stage
+from mphdrr.addon.figures.stage import FigureScene
 from mphdrr.addon.scanner import scanner, selection
 from mphdrr.addon.volumes import volumes
 from mphdrr.core.recording import recorded_warnings
@@ -80,8 +80,10 @@ def test_an_animation_has_the_phantom_on_its_first_and_last_picture(example, tmp
 
 
 def test_an_animation_that_is_ended_keeps_its_pictures(example, tmp_path, monkeypatch):
-    monkeypatch.setattr(figures, "_render", lambda scene: (yield) or np.full((SIZE[1], SIZE[0], 3), 200, np.uint8))
-    monkeypatch.setattr(figures, "_leave_a_trace", lambda *_: (yield) or True)
+    monkeypatch.setattr(
+        figures, "_render_pixels", lambda scene: (yield) or np.full((SIZE[1], SIZE[0], 3), 200, np.uint8)
+    )
+    monkeypatch.setattr(figures, "_are_visible", lambda *_: (yield) or True)
     path = tmp_path / "film.mp4"
     path.write_bytes(b"older")
 
@@ -95,10 +97,10 @@ def test_an_animation_that_is_ended_keeps_its_pictures(example, tmp_path, monkey
     job, steps = started()
     with pytest.raises(mph.Cancelled):
         steps.throw(mph.Cancelled())
-    assert job.left() == f"3 pictures are in {tmp_path / 'film-frames'}"
+    assert job.leftovers() == f"3 pictures are in {tmp_path / 'film-frames'}"
     assert len(list((tmp_path / "film-frames").iterdir())) == 3 and path.read_bytes() == b"older"
     job, steps = started()
-    job.enough.set()
+    job.finish_now.set()
     list(steps)
     assert bpy.data.movieclips.load(str(path)).frame_duration == 3
     assert sorted(found.name for found in tmp_path.iterdir()) == ["film-frames", "film.mp4"]
@@ -106,13 +108,13 @@ def test_an_animation_that_is_ended_keeps_its_pictures(example, tmp_path, monkey
 
 def test_a_volume_that_cycles_does_not_draw_is_a_surface(example, tmp_path, monkeypatch):
     """As in a Blender whose Cycles draws no volumes: here the stage has it far away."""
-    put = Stage._put_volume
+    put = FigureScene._add_volume
 
-    def put_far_away(stage: Stage, item: bpy.types.Object) -> None:
+    def put_far_away(stage: FigureScene, item: bpy.types.Object) -> None:
         put(stage, item)
-        stage.drawn[0].location.z += 1e5
+        stage.volume_objects[0].location.z += 1e5
 
-    monkeypatch.setattr(Stage, "_put_volume", put_far_away)
+    monkeypatch.setattr(FigureScene, "_add_volume", put_far_away)
     path = tmp_path / "picture.png"
     with recorded_warnings() as said:
         jobs.run(figures.figure_job(bpy.context, "picture", [path], SIZE, labels=False, samples=2))

@@ -9,7 +9,7 @@ import pytest
 
 from mphdrr.addon import preferences
 from mphdrr.addon.blender import storage
-from mphdrr.core.projector import backends, parallel
+from mphdrr.core.rays import backends, parallel
 
 
 @pytest.fixture(autouse=True)

@@ -27,7 +27,7 @@ def scanned(scene, ring_system):
 
 
 def shown(quick=True, voxels=None):
-    return preview.make(preview.request(bpy.context), quick, {} if voxels is None else voxels)
+    return preview.make_preview(preview.read_request(bpy.context), quick, {} if voxels is None else voxels)
 
 
 @pytest.mark.parametrize("settings", [{}, {"model": "EMISSION", "time": 60.0}, {"detector": "REAL", "pitch": 0.3}])
@@ -59,10 +59,10 @@ def test_counts_are_shown_per_pixel_of_the_panel_whatever_the_number_of_pixels(s
 def test_what_moves_is_asked_for_anew_and_voxels_are_read_once(scanned, scene, monkeypatch):
     camera, phantom = scanner.module(scanner.active_scanner(scene), 3), bpy.data.objects["Derenzo"]
     voxels = {}
-    before = preview.request(bpy.context)
-    preview.make(before, True, voxels)
+    before = preview.read_request(bpy.context)
+    preview.make_preview(before, True, voxels)
     monkeypatch.setattr(preview.vdb, "read_vdb", None)  # nothing is read again
-    assert preview.request(bpy.context).same_as(before)
+    assert preview.read_request(bpy.context).equals(before)
     edits = (
         lambda: setattr(camera.location, "x", camera.location.x + 1),
         lambda: setattr(phantom.location, "x", 12.0),
@@ -74,9 +74,9 @@ def test_what_moves_is_asked_for_anew_and_voxels_are_read_once(scanned, scene, m
     for edit in edits:
         edit()
         bpy.context.view_layer.update()
-        now = preview.request(bpy.context)
-        assert not now.same_as(before)
-        preview.make(now, True, voxels)
+        now = preview.read_request(bpy.context)
+        assert not now.equals(before)
+        preview.make_preview(now, True, voxels)
         before = now
     assert [len(voxels), before.system.numbers.tolist()] == [1, [5]]
 
@@ -110,19 +110,19 @@ def test_what_cannot_be_previewed_is_said_in_a_line(scanned, scene, monkeypatch)
 
     def look():
         session.has_changed = True
-        session.look(bpy.context)
+        session.take_turn(bpy.context)
         if session.worker is not None:
             session.worker.join()
-            session.look(bpy.context)
+            session.take_turn(bpy.context)
         seen.append(session.problem)
         return session.lines
 
-    assert "pixels" in look()[1] and session.shown.is_quick
+    assert "pixels" in look()[1] and session.preview.is_quick
     camera.mphdrr_module.pinhole_diameter = 400.0
     assert look()[0] == "No preview" and "pinhole_diameter" in look()[1]
     camera.mphdrr_module.pinhole_diameter = 2.3
     assert "pixels" in look()[1]
-    monkeypatch.setattr(preview, "MOST_KEPT", 1000)
+    monkeypatch.setattr(preview, "MAX_CACHED_BYTES", 1000)
     assert "128 KiB of voxels; a live preview keeps at most 1 KiB" in look()[1]
     monkeypatch.undo()
     volumes.file_of(phantom).unlink()
@@ -130,34 +130,34 @@ def test_what_cannot_be_previewed_is_said_in_a_line(scanned, scene, monkeypatch)
     assert "no such file" in look()[1]
     bpy.data.objects.remove(phantom)
     assert "no volume" in look()[1]
-    assert session.shown is None
+    assert session.preview is None
 
 
 def test_a_picture_that_takes_long_says_that_it_is_of_before(scanned, scene, monkeypatch):
-    session, go_on, make = preview.Session(), threading.Event(), preview.make
-    session.look(bpy.context)
+    session, go_on, make = preview.Session(), threading.Event(), preview.make_preview
+    session.take_turn(bpy.context)
     session.worker.join()
-    session.look(bpy.context)
+    session.take_turn(bpy.context)
     before = session.lines
-    monkeypatch.setattr(preview, "make", lambda *arguments: go_on.wait(60) and make(*arguments))
+    monkeypatch.setattr(preview, "make_preview", lambda *arguments: go_on.wait(60) and make(*arguments))
     monkeypatch.setattr(preview, "_PATIENCE", 0.0)
     bpy.data.objects["Derenzo"].location.x = 7.0
     bpy.context.view_layer.update()
     session.has_changed, session.full_at = True, None
-    session.look(bpy.context)
-    session.look(bpy.context)
+    session.take_turn(bpy.context)
+    session.take_turn(bpy.context)
     assert session.lines == (*before, "Being made again after a change")
     go_on.set()
     session.worker.join()
-    session.look(bpy.context)
-    assert "Being made" not in " ".join(session.lines) and session.shown.is_quick
+    session.take_turn(bpy.context)
+    assert "Being made" not in " ".join(session.lines) and session.preview.is_quick
 
 
 def test_a_phantom_that_has_changed_is_previewed_as_it_was_built(scanned, scene):
     phantom = bpy.data.objects["Derenzo"]
     before = shown()
     phantom.mphdrr_volume.outdated = True
-    assert phantoms.outdated(phantom) == phantom
+    assert phantoms.outdated_phantom(phantom) == phantom
     after = shown()
     np.testing.assert_array_equal(before.run.projections, after.run.projections)
     assert "Derenzo as it was last built" in " ".join(after.lines) and "last built" not in " ".join(before.lines)
@@ -166,11 +166,11 @@ def test_a_phantom_that_has_changed_is_previewed_as_it_was_built(scanned, scene)
 def test_switched_off_it_does_nothing(scanned, scene):
     assert preview.session() is None
     preview.after_update(scene, None)
-    assert not bpy.app.timers.is_registered(preview._look)
+    assert not bpy.app.timers.is_registered(preview._take_turn)
     preview.start()
-    assert preview.session() is not None and bpy.app.timers.is_registered(preview._look)
+    assert preview.session() is not None and bpy.app.timers.is_registered(preview._take_turn)
     bpy.ops.wm.read_homefile(use_empty=True)
-    assert preview.session() is None and not bpy.app.timers.is_registered(preview._look)
+    assert preview.session() is None and not bpy.app.timers.is_registered(preview._take_turn)
 
 
 def test_a_noisy_preview_draws_as_the_recipe_says(scanned, scene):
@@ -183,4 +183,4 @@ def test_a_noisy_preview_draws_as_the_recipe_says(scanned, scene):
 
 def test_without_a_scanner_or_an_active_module(scene):
     with pytest.raises(InputError, match="no scanner"):
-        preview.request(bpy.context)
+        preview.read_request(bpy.context)

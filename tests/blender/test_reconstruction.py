@@ -14,7 +14,7 @@ import mphdrr.core as mph
 from mphdrr.addon import registration
 from mphdrr.addon.blender import ids, jobs, plots, storage, windows
 from mphdrr.addon.reconstruction import reconstructions
-from mphdrr.addon.reconstruction.reconstruction_properties import PROPERTIES, drawn, settings_recipe
+from mphdrr.addon.reconstruction.reconstruction_properties import PROPERTIES, panel_properties, settings_recipe
 from mphdrr.addon.scanner import scanner
 from mphdrr.addon.volumes import slices, volumes
 from mphdrr.core.progress import Cancelled
@@ -71,7 +71,7 @@ def test_the_volume_is_that_of_the_command_line(render, scene):
     found = volumes.volume_from_object(item)
     np.testing.assert_allclose(found.array, expected.volume.array, rtol=1e-6)
     np.testing.assert_allclose(found.grid.affine, expected.volume.grid.affine, atol=1e-6)
-    known = scene.mphdrr_reconstruction.known
+    known = scene.mphdrr_reconstruction.details
     assert known["title"] == "OSEM, 3 iterations" and known["name"] == "log-likelihood"
     np.testing.assert_allclose(known["objective"], expected.objective)
     assert [name for name, _ in known["scores"]] == ["NRMSE"] and known["voxels"] == "14 x 14 x 14 voxels of 7 mm"
@@ -89,9 +89,9 @@ def test_panel_settings_count_and_scripts_override_them(render, scene):
     panel = scene.mphdrr_reconstruction
     panel.method, panel.iterations, panel.voxels, panel.spacing = "MLEM", 2, 10, 9.0
     assert bpy.ops.mphdrr.reconstruct() == {"FINISHED"}
-    assert panel.known["title"] == "MLEM, 2 iterations" and reconstructed().mphdrr_volume.shape[:] == (10, 10, 10)
+    assert panel.details["title"] == "MLEM, 2 iterations" and reconstructed().mphdrr_volume.shape[:] == (10, 10, 10)
     assert bpy.ops.mphdrr.reconstruct(iterations=1) == {"FINISHED"}
-    assert panel.known["title"] == "MLEM, 1 iteration"
+    assert panel.details["title"] == "MLEM, 1 iteration"
     with pytest.raises(RuntimeError, match=r"Subsets needs Method OSEM"):
         bpy.ops.mphdrr.reconstruct(subsets=2)
     with pytest.raises(RuntimeError, match="Weight: missing"):
@@ -106,7 +106,7 @@ def test_the_panel_untouched_gives_each_method_its_own_defaults(name, scene):
     given = {key.partition(".")[2]: value for key, value in recipe.given.items()}
     assert given.pop("method", "osem") == name
     assert all(value == own[each] for each, value in given.items() if each in own)
-    assert own.keys() - {"prior", "weight"} <= dict(drawn(panel)).keys()
+    assert own.keys() - {"prior", "weight"} <= dict(panel_properties(panel)).keys()
     assert f"OSEM 10, MLEM 50, BSREM 30, SIRT {METHODS['sirt'].own['iterations']}" in (
         panel.bl_rna.properties["iterations"].description
     )
@@ -121,7 +121,7 @@ def test_without_a_number_each_method_does_its_own(render, scene):
         if method.of_counts:
             panel.method = name.upper()
             assert bpy.ops.mphdrr.reconstruct() == {"FINISHED"}
-            assert panel.known["title"] == f"{method.label}, {method.own['iterations']} iterations"
+            assert panel.details["title"] == f"{method.label}, {method.own['iterations']} iterations"
 
 
 def test_a_methods_own_settings_are_in_the_panel(render, scene):
@@ -152,10 +152,11 @@ def test_a_file_can_be_the_method_and_the_result_says_so(render, scene, monkeypa
     panel = scene.mphdrr_reconstruction
     panel.method, panel.prior, panel.weight, panel.iterations, panel.voxels = "BSREM", "QUADRATIC", 0.5, 4, 10
     panel.method_file = str(tmp_path / "model.toy")
-    assert set(dict(drawn(panel))) == {"ignore_attenuation", "ignore_blur", "hole", "aperture_points", "pixel_points",
+    drawn = set(dict(panel_properties(panel)))
+    assert drawn == {"ignore_attenuation", "ignore_blur", "hole", "aperture_points", "pixel_points",
                                        "method_file"}  # fmt: skip
     assert bpy.ops.mphdrr.reconstruct() == {"FINISHED"}
-    known, found = panel.known, volumes.volume_from_object(reconstructed())
+    known, found = panel.details, volumes.volume_from_object(reconstructed())
     assert known["title"] == "Network model.toy (Toy)" and known["flatters"][0] == "it was trained for another scanner"
     assert reconstructed().name.endswith("Network model.toy (Toy)") and known["objective"] == []
     assert found.grid.shape == grid.shape and (found.array == 2).all()
@@ -167,7 +168,7 @@ def test_a_file_can_be_the_method_and_the_result_says_so(render, scene, monkeypa
         bpy.ops.mphdrr.reconstruct()
     panel.method_file = ""
     assert bpy.ops.mphdrr.reconstruct(method_file="", iterations=1) == {"FINISHED"}
-    assert panel.known["title"] == "BSREM, 1 iteration"
+    assert panel.details["title"] == "BSREM, 1 iteration"
 
 
 def test_every_setting_is_in_the_panel_or_left_to_files(scene):
@@ -183,11 +184,11 @@ def test_every_setting_is_in_the_panel_or_left_to_files(scene):
     }
     recipe = settings_recipe(lambda name: getattr(panel, name), lambda name: False)
     assert all(recipe[setting.key] == setting.default for setting in PROPERTIES.values())
-    assert "weight" not in dict(drawn(panel)) and "subsets" in dict(drawn(panel))
+    assert "weight" not in dict(panel_properties(panel)) and "subsets" in dict(panel_properties(panel))
     panel.prior = "RELATIVE_DIFFERENCE"
-    assert {"weight", "gamma", "edge"} <= dict(drawn(panel)).keys()
+    assert {"weight", "gamma", "edge"} <= dict(panel_properties(panel)).keys()
     panel.method, panel.prior = "MLEM", "NONE"
-    assert "subsets" not in dict(drawn(panel))
+    assert "subsets" not in dict(panel_properties(panel))
 
 
 def test_without_a_run_the_button_says_why(scene):
@@ -207,22 +208,22 @@ def job_of(scene) -> jobs.Job:
     panel = scene.mphdrr_reconstruction
     for name, value in SMALL.items():
         setattr(panel, name, value)
-    return reconstructions.reconstructing(
+    return reconstructions.reconstruct_job(
         bpy.context, settings_recipe(lambda name: getattr(panel, name), lambda name: False)
     )
 
 
 def test_it_is_shown_while_it_runs_and_cancelled_without_a_trace(render, scene, monkeypatch):
     before = state()
-    monkeypatch.setattr(reconstructions, "_BETWEEN", -1.0)
+    monkeypatch.setattr(reconstructions, "_MIN_INTERVAL", -1.0)
     monkeypatch.setattr(windows, "has_window", lambda: True)
     job, seen = job_of(scene), []
 
     def progress(done: int, total: int) -> None:
-        job.look()  # the window does so from time to time
+        job.refresh()  # the window does so from time to time
         if reconstructed() is not None:
-            seen.append(len(scene.mphdrr_reconstruction.known["objective"]))
-            assert scene.mphdrr_reconstruction.known["scores"] == []
+            seen.append(len(scene.mphdrr_reconstruction.details["objective"]))
+            assert scene.mphdrr_reconstruction.details["scores"] == []
             if seen[-1] == 2:
                 raise Cancelled
 
@@ -233,18 +234,18 @@ def test_it_is_shown_while_it_runs_and_cancelled_without_a_trace(render, scene, 
 
 
 def test_finish_now_keeps_what_there_is(render, scene, monkeypatch):
-    monkeypatch.setattr(reconstructions, "_BETWEEN", -1.0)
+    monkeypatch.setattr(reconstructions, "_MIN_INTERVAL", -1.0)
     monkeypatch.setattr(windows, "has_window", lambda: True)
     files = set(storage.folder().iterdir())
     job = job_of(scene)
 
     def progress(done: int, total: int) -> None:
-        job.look()
+        job.refresh()
         if reconstructed() is not None:
-            job.enough.set()
+            job.finish_now.set()
 
     text = jobs.run(job, progress)
-    assert "OSEM, 2 iterations" in text and len(scene.mphdrr_reconstruction.known["objective"]) == 2
+    assert "OSEM, 2 iterations" in text and len(scene.mphdrr_reconstruction.details["objective"]) == 2
     assert len(set(storage.folder().iterdir()) - files) == 2, "files of states that were shown meanwhile are gone"
     assert len([item for item in volumes.volume_objects(scene) if "OSEM" in item.name]) == 1
 
@@ -256,12 +257,12 @@ def test_continue_goes_on_as_if_there_had_been_no_break(render, scene, monkeypat
     first, record = reconstructed(), scene.mphdrr_reconstruction.record
     array = volumes.volume_from_object(first).array
     monkeypatch.setattr(windows, "has_window", lambda: True)
-    monkeypatch.setattr(reconstructions, "_BETWEEN", -1.0)
-    job = reconstructions.continuing(bpy.context)
+    monkeypatch.setattr(reconstructions, "_MIN_INTERVAL", -1.0)
+    job = reconstructions.continue_job(bpy.context)
 
     def cancel(done: int, total: int) -> None:
-        job.look()
-        if len(scene.mphdrr_reconstruction.known["objective"]) > 4:
+        job.refresh()
+        if len(scene.mphdrr_reconstruction.details["objective"]) > 4:
             raise Cancelled
 
     with pytest.raises(Cancelled):
@@ -270,7 +271,7 @@ def test_continue_goes_on_as_if_there_had_been_no_break(render, scene, monkeypat
     np.testing.assert_array_equal(volumes.volume_from_object(first).array, array)
     monkeypatch.undo()
     assert bpy.ops.mphdrr.continue_reconstruction() == {"FINISHED"}
-    assert reconstructed() == first and scene.mphdrr_reconstruction.known["title"] == "OSEM, 13 iterations"
+    assert reconstructed() == first and scene.mphdrr_reconstruction.details["title"] == "OSEM, 13 iterations"
     bpy.ops.mphdrr.reconstruct(**SMALL | {"iterations": 13})
     assert first.hide_get() and reconstructed() != first
     both = [volumes.volume_from_object(item).array for item in (first, reconstructed())]
@@ -283,16 +284,16 @@ def test_continue_goes_on_after_files_were_moved_and_opened_again(render, scene,
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "second.blend"))
     shutil.rmtree(tmp_path / "first_mphdrr")
     bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "second.blend"))
-    kept = reconstructions.resumable(bpy.context)
+    kept = reconstructions.resume_path(bpy.context)
     assert kept.parent.name == "second_mphdrr" and kept not in storage.unused_volumes()
     assert bpy.ops.mphdrr.continue_reconstruction() == {"FINISHED"}
     first = reconstructed()
-    assert bpy.context.scene.mphdrr_reconstruction.known["title"] == "OSEM, 13 iterations"
+    assert bpy.context.scene.mphdrr_reconstruction.details["title"] == "OSEM, 13 iterations"
     assert kept in storage.unused_volumes()
     bpy.ops.mphdrr.reconstruct(**SMALL | {"iterations": 13})
     both = [volumes.volume_from_object(item).array for item in (first, reconstructed())]
     np.testing.assert_allclose(*both, rtol=1e-5)
-    reconstructions.resumable(bpy.context).unlink()
+    reconstructions.resume_path(bpy.context).unlink()
     with pytest.raises(RuntimeError, match="poll"):
         bpy.ops.mphdrr.continue_reconstruction()
 
@@ -337,7 +338,7 @@ def test_the_panel_draws_the_result(render, scene):
         "Reconstruct",
     } <= set(said)
     assert any(text.startswith("8 mm") for text in said)
-    flatters = scene.mphdrr_reconstruction.known["flatters"]
+    flatters = scene.mphdrr_reconstruction.details["flatters"]
     assert flatters and all(word in " ".join(said) for word in " ".join(flatters).split()), (
         "the warning stays with the score"
     )
@@ -355,4 +356,4 @@ def test_a_saved_file_opens_with_its_reconstruction(render, scene, tmp_path):
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "a.blend"))
     bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "a.blend"))
     assert volumes.volume_from_object(reconstructed()).array.max() > 0
-    assert bpy.context.scene.mphdrr_reconstruction.known["title"] == "OSEM, 3 iterations"
+    assert bpy.context.scene.mphdrr_reconstruction.details["title"] == "OSEM, 3 iterations"

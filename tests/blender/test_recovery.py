@@ -22,7 +22,7 @@ TANK = {"rod_diameters": (0,) * 6, "sphere_diameters": (30, 0, 0, 0, 0, 0)}  # l
 def crashed(scene, small_workbook, tmp_path, capsys):
     """A scene with volumes of every origin, opened again after their files have gone; returns their voxels by name."""
     bpy.ops.mphdrr.import_geometry(filepath=str(small_workbook))
-    job = phantoms.adding(phantom_properties.plain_settings("jaszczak", voxels=24, **TANK), "Tank", None, True)
+    job = phantoms.add_phantom_job(phantom_properties.plain_settings("jaszczak", voxels=24, **TANK), "Tank", None, True)
     jobs.run(job)
     bpy.data.objects["Tank"].location = (3.0, 4.0, 5.0)
     bpy.ops.mphdrr.add_map(quantity="modules", voxels=6, side=90, within_roi=False)
@@ -31,7 +31,7 @@ def crashed(scene, small_workbook, tmp_path, capsys):
     volumes.add_volume(Volume(np.ones((4, 4, 4)), Grid.centered(4, 1.0), "hu"), "CT")
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "study.blend"))
     shutil.rmtree(tmp_path / "study_mphdrr")
-    storage._size_at.cache_clear()
+    storage._cached_size.cache_clear()
     bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "study.blend"))
     said = capsys.readouterr().out
     assert "Modules map, Tank are missing: press Make Again" in said
@@ -49,11 +49,11 @@ def test_one_update_gives_one_grid(crashed):
 
 
 def test_all_with_a_recipe_are_made_again_where_they_were(crashed, capsys):
-    storage._size_at.cache_clear()
+    storage._cached_size.cache_clear()
     assert bpy.ops.mphdrr.remake_volumes() == {"FINISHED"}
     assert "CT: find the voxel files" in capsys.readouterr().out
-    storage._size_at.cache_clear()
-    again, others = recovery.missing(bpy.context.scene)
+    storage._cached_size.cache_clear()
+    again, others = recovery.missing_volumes(bpy.context.scene)
     assert again == [] and [item.name for item in others] == ["CT"]
     assert set(crashed) == {"Tank", "Tank mu", "Modules map"}
     for name, volume in crashed.items():

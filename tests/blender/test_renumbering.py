@@ -64,10 +64,10 @@ def test_added_and_removed_modules_get_the_numbers_between(scene, small_workbook
     gone = [scanner.module(collection, n) for n in (3, 4, 15)]
     scanner.module(collection, 7).name = "Mine"
     scanner.module(collection, 14).mphdrr_module.pinhole_diameter = 2.5
-    module_edits.remove(collection, gone)
-    (added,) = module_edits.duplicate(collection, [scanner.module(collection, 16)], 1, np.radians(10.0), False)
+    module_edits.remove_modules(collection, gone)
+    (added,) = module_edits.duplicate_modules(collection, [scanner.module(collection, 16)], 1, np.radians(10.0), False)
     assert added.mphdrr_module.number == 17
-    module_edits.duplicate(collection, [scanner.module(collection, 2)], 1, np.radians(10.0), False)
+    module_edits.duplicate_modules(collection, [scanner.module(collection, 2)], 1, np.radians(10.0), False)
     places = scanner.read_scanner(collection).centers[-2:]
     assert bpy.ops.mphdrr.renumber_modules() == {"FINISHED"}
     read = scanner.read_scanner(collection)
@@ -77,7 +77,7 @@ def test_added_and_removed_modules_get_the_numbers_between(scene, small_workbook
     assert np.array_equal(others, np.delete(system.centers, [2, 3, 14], axis=0))
     assert read.pinhole_diameter[12] == 2.5 and scanner.module(collection, 6).name == "Mine"
     # A further copy belongs to the scanner, whatever numbers its modules were imported with.
-    (copy,) = module_edits.duplicate(collection, [scanner.module(collection, 1)], 1, np.radians(-9.0), False)
+    (copy,) = module_edits.duplicate_modules(collection, [scanner.module(collection, 1)], 1, np.radians(-9.0), False)
     assert copy.mphdrr_module.number == 16
     bpy.ops.mphdrr.export_geometry(filepath=str(tmp_path / "new.xlsx"))
     written = mph.read_system(tmp_path / "new.xlsx")

@@ -180,8 +180,8 @@ def test_the_list_keeps_two_and_what_is_renamed_or_pinned(render, scene):
     assert not first.exists() and second == first
     files = [storage.absolute(item.file) for item in listed]
     assert len(set(files)) == 4 and sorted(storage.folder().glob("*.h5")) == sorted(files)
-    assert len({item.name for item in listed}) == 4 and runs.shown(scene) == listed[3]
-    assert "KiB" in runs.size_text(listed)
+    assert len({item.name for item in listed}) == 4 and runs.shown_run(scene) == listed[3]
+    assert "KiB" in runs.file_size_text(listed)
 
 
 def test_choosing_a_run_shows_its_images_and_removing_it_removes_its_file(render, scene):
@@ -208,7 +208,7 @@ def test_removing_another_run_leaves_the_shown_one(render, scene):
     render(), render()
     shown = settings.runs[1].name
     bpy.ops.mphdrr.remove_run(index=0)
-    assert runs.shown(scene).name == shown and settings.active_run == 0
+    assert runs.shown_run(scene).name == shown and settings.active_run == 0
 
 
 def test_two_runs_survive_save_and_reopen(render, scene, tmp_path):
@@ -258,11 +258,11 @@ def test_a_run_whose_file_is_gone_is_said_and_does_not_stop_saving(render, scene
     gone.unlink()
     with pytest.raises(RuntimeError, match="the run's file is gone"):
         bpy.ops.mphdrr.show_run(index=0)
-    assert runs.shown(scene) == settings.runs[1] and "missing" in runs.size_text([settings.runs[0]])
+    assert runs.shown_run(scene) == settings.runs[1] and "missing" in runs.file_size_text([settings.runs[0]])
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "a.blend"))
     assert storage.absolute(settings.runs[1].file).parent == tmp_path / "a_mphdrr"
     settings.active_run = 0  # chosen in the list
-    assert runs.shown(scene) == settings.runs[1]
+    assert runs.shown_run(scene) == settings.runs[1]
 
 
 def test_the_difference_of_two_runs_is_drawn_and_said(render, scene, capfd):
@@ -287,7 +287,7 @@ def test_the_difference_of_two_runs_is_drawn_and_said(render, scene, capfd):
 def test_the_example_is_current(scene):
     assert bpy.ops.mphdrr.load_example() == {"FINISHED"}
     assert runs.changes(scene) == [] and len(scene.mphdrr_projections.runs) == 1
-    run = read_run(rendering.file_of(scene.mphdrr_projections.run_file))
+    run = read_run(rendering.run_file_path(scene.mphdrr_projections.run_file))
     shown = volumes.reader(bpy.data.objects["Derenzo"])()
     np.testing.assert_array_equal(run.volume.array, shown.array)
     np.testing.assert_allclose(run.volume.grid.affine, shown.grid.affine, atol=1e-4)
@@ -336,7 +336,7 @@ def test_a_volume_that_is_not_in_the_panel_is_found_again(render, scene):
     set_(volume=bpy.data.objects["Other"])
     assert runs.changes(scene) == ["volume Derenzo, now Other"] and runs.volume_to_render(scene) == ""
     assert bpy.ops.mphdrr.render_projections() == {"FINISHED"}
-    assert runs.changes(scene) == [] and rendering.file_of(scene.mphdrr_projections.run_file)
+    assert runs.changes(scene) == [] and rendering.run_file_path(scene.mphdrr_projections.run_file)
 
 
 def test_two_runs_of_blender_4_5_open_in_every_version(scene, tmp_path):
@@ -346,7 +346,7 @@ def test_two_runs_of_blender_4_5_open_in_every_version(scene, tmp_path):
     bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "runs-4.5.blend"))
     scene = bpy.context.scene
     before, after = scene.mphdrr_projections.runs
-    assert (before.name, after.name) == ("Before", "Derenzo, emission") and runs.shown(scene) == after
+    assert (before.name, after.name) == ("Before", "Derenzo, emission") and runs.shown_run(scene) == after
     hole = ["hole Rays, now Automatic"]  # its middle, the default of that version
     assert runs.changes(scene, before) == ["Module 03 moved", "phantom Derenzo turned", *hole]
     assert runs.changes(scene) == hole

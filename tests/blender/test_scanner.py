@@ -115,7 +115,7 @@ def test_moved_camera_and_edited_number_are_read(scene, ring_system):
     assert back.pinhole_diameter.tolist() == [2.3, 2.3, 2.3, 3.0, 2.3, 2.3, 2.3, 2.3]
     assert back.source is None
     assert not back.tilt.any() and scanner.aim_modules(collection) == []
-    assert np.allclose(objects.world_matrix(third), cameras.matrices_of(back.poses())[2], atol=2e-5)
+    assert np.allclose(objects.world_matrix(third), cameras.camera_matrices(back.poses())[2], atol=2e-5)
 
 
 def test_hidden_or_parented_camera_is_read_where_it_is(scene, ring_system):

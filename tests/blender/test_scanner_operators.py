@@ -72,9 +72,9 @@ def test_aim_turns_moved_modules_back(scene, small_workbook):
     bpy.ops.mphdrr.import_geometry(filepath=str(small_workbook))
     collection = scanner.active_scanner(scene)
     scanner.module(collection, 12).rotation_euler.y += 0.2
-    assert scanner.off_aim(collection, scanner.modules(collection)) == [12]
+    assert scanner.unaimed_numbers(collection, scanner.modules(collection)) == [12]
     bpy.ops.mphdrr.aim_modules()
-    assert scanner.off_aim(collection, scanner.modules(collection)) == []
+    assert scanner.unaimed_numbers(collection, scanner.modules(collection)) == []
 
 
 def test_import_again_keeps_the_pictures_behind_cameras(scene, small_workbook):

@@ -77,7 +77,7 @@ def test_cameras_that_were_edited_are_named_until_they_are_reset(scene, ring_sys
     }.items():
         setattr(camera.data, name, value)
         bpy.context.view_layer.update()
-        assert "reset_cameras" in said() and "edited of 1" in said(), name
+        assert "reset_cameras" in said() and "of 1 camera" in said(), name
         assert bpy.ops.mphdrr.reset_cameras() == {"FINISHED"}
         assert "reset_cameras" not in said(), name
         module = camera.mphdrr_module

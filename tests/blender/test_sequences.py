@@ -32,7 +32,7 @@ def beats() -> list[Volume]:
 @pytest.mark.long
 def test_every_frame_has_its_state_of_the_torso(scene):
     assert bpy.ops.mphdrr.add_torso(voxels=12, frames=2) == {"FINISHED"}
-    item, recipe = bpy.context.object, phantoms.recipe_of(plain_settings("torso", voxels=12, frames=2))
+    item, recipe = bpy.context.object, phantoms.copy_settings(plain_settings("torso", voxels=12, frames=2))
     assert recipe.settings["frames"] == 2 and list(recipe.states) == list(CardiacTorso().beating(2))
     states = [state.voxelize(recipe.grid).array for state in recipe.states]
     for frame in (1, 2, 3):

@@ -41,7 +41,7 @@ def test_a_rendered_scanner_is_neither_black_nor_bleached(scene, dc_spect, tmp_p
         scene.world = None
     scanner.build_scanner(scene, dc_spect[::4])
     studio.light(scene)
-    camera = studio.aimed(bpy.data.cameras.new("View"), Vector((0, 60, 0)), Vector((550, -400, 400)))
+    camera = studio.new_aimed_object(bpy.data.cameras.new("View"), Vector((0, 60, 0)), Vector((550, -400, 400)))
     camera.data.clip_end = 5000.0
     scene.collection.objects.link(camera)
     scene.camera, scene.render.engine, scene.cycles.samples = camera, "CYCLES", 1

@@ -72,7 +72,7 @@ def test_turning_a_camera_tilts_its_module_and_aiming_it_takes_the_tilt(scene, r
     others = np.arange(8) != 3
     assert not read.tilt[others].any() and 0.03 < np.linalg.norm(read.tilt[3]) < 0.06
     assert np.array_equal(read.centers, ring_system.centers)
-    assert np.allclose(read.poses()[3], cameras.poses_of(objects.world_matrix(camera)[None])[0], atol=1e-6)
+    assert np.allclose(read.poses()[3], cameras.module_poses(objects.world_matrix(camera)[None])[0], atol=1e-6)
     assert scanner.losses(collection) == ["module 4 moved or turned"]
     camera.rotation_euler = before
     bpy.context.view_layer.update()
@@ -108,7 +108,7 @@ def test_a_tilted_module_that_is_only_moved_keeps_its_direction(collection, tilt
 
 def test_copies_along_the_ring_keep_the_tilt(collection, tilted):
     for follow_ring in (False, True):
-        (copy,) = module_edits.duplicate(
+        (copy,) = module_edits.duplicate_modules(
             collection, [scanner.module(collection, 3)], 1, 0.21 + follow_ring / 10, follow_ring
         )
         assert np.allclose(scanner.read_module(collection, copy).tilt, tilted.tilt[2], rtol=0, atol=1e-12)

@@ -105,9 +105,9 @@ def test_a_run_belongs_to_its_scanner(scene, a_and_b):
         view_layer=bpy.context.view_layer, mode="OBJECT",
     )  # fmt: skip
     place = (column + 3) / width, 1 - (row + 3) / height
-    assert tiles.pick(context, *place) == scanner.module(a, 6).name
+    assert tiles.pick_module(context, *place) == scanner.module(a, 6).name
     bpy.context.view_layer.update()
     assert shown(scene) == ("A", 6, 6) and tiles.active_tile(bpy.context, mosaic) == found["numbers"].index(6)
     bpy.data.collections.remove(a)
     with pytest.raises(InputError, match="not in the scene"):
-        tiles.pick(context, *place)
+        tiles.pick_module(context, *place)

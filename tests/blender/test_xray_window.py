@@ -49,7 +49,7 @@ def test_looking_through_a_panel_that_is_not_square_stretches_nothing(scene, sma
 def test_what_the_panel_shows_is_what_is_rendered(scene):
     bpy.ops.mphdrr.add_xray_system(sources=24, pixels=20)
     collection, panel = scanner.active_scanner(scene), scene.mphdrr_projections
-    assert scanner.own_pixels(collection) == (20, 20)
+    assert scanner.fixed_pixels(collection) == (20, 20)
     assert (panel.model, scene.mphdrr_reconstruction.method) == ("TRANSMISSION", "SIRT")
     panel.width, panel.detector = 48, "REAL"  # for pinholes
     recipe = runs.panel_recipe(scene)
@@ -61,7 +61,7 @@ def test_what_the_panel_shows_is_what_is_rendered(scene):
     grid = mph.Grid.centered(12, 12.0)
     values = np.random.default_rng(3).uniform(0.0, 0.02, grid.shape).astype(np.float32)
     volumes.add_volume(mph.Volume(values, grid, "mu"), "Body")
-    assert preview.request(bpy.context).recipe["detector.rows"] == 20
+    assert preview.read_request(bpy.context).recipe["detector.rows"] == 20
     assert bpy.ops.mphdrr.render_projections() == {"FINISHED"}
     run = mph.read_run(storage.absolute(panel.run_file))
     assert run.projections.shape == (24, 20, 20)

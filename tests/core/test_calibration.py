@@ -13,8 +13,8 @@ from mphdrr.core.cli import main
 
 pytest.importorskip("scipy", reason="no scipy")
 
-from mphdrr.core.design.bundle import Bundle
-from mphdrr.core.design.point_images import disc_in_quadrants
+from mphdrr.core.design.bundle import BundleAdjustment
+from mphdrr.core.design.point_images import quadrant_areas
 from mphdrr.core.geometry.frames import affine_matrix
 
 SHAPE = (48, 48)
@@ -80,12 +80,11 @@ def some(scanner):
 
 def test_areas_of_discs_and_their_derivatives(rng):
     u, v, radii = rng.uniform(-2, 2, (4, 9)), rng.uniform(-2, 2, (4, 7)), rng.uniform(0.3, 1.7, 4)
-    areas, *slopes = disc_in_quadrants(u, v, radii)
+    areas, *slopes = quadrant_areas(u, v, radii)
     step = 1e-6
     for slope, along in zip(slopes, np.eye(3), strict=True):
         ends = [
-            disc_in_quadrants(*(x + s * step * d for x, d in zip((u, v, radii), along, strict=True)))[0]
-            for s in (1, -1)
+            quadrant_areas(*(x + s * step * d for x, d in zip((u, v, radii), along, strict=True)))[0] for s in (1, -1)
         ]
         assert np.allclose((ends[0] - ends[1]) / (2 * step), slope, atol=1e-7)
     grid = (
@@ -95,7 +94,7 @@ def test_areas_of_discs_and_their_derivatives(rng):
         inside = (grid**2).sum(axis=1) < radii[s] ** 2
         counted = (inside & (grid[:, 0] < u[s, 0]) & (grid[:, 1] < v[s, 0])).sum()
         assert areas[s, 0, 0] == pytest.approx(counted / 100**2, abs=0.02)
-    whole = disc_in_quadrants(np.full((4, 1), 9.0), np.full((4, 1), 9.0), radii)[0]
+    whole = quadrant_areas(np.full((4, 1), 9.0), np.full((4, 1), 9.0), radii)[0]
     assert np.allclose(whole.ravel(), np.pi * radii**2)
 
 
@@ -122,7 +121,7 @@ def test_the_jacobian_is_that_of_central_differences(some, rng):
     system = some.replace(tilt=rng.normal(0, 0.02, (m, 3)))
     sd = np.array([5.0] * 3 + [0.03] * 3 + [1.0, 0.5, 0.5])
     seen = rng.normal(0, 5, (5, m, 2)), np.broadcast_to(np.eye(2), (5, m, 2, 2)), rng.uniform(size=(5, m)) < 0.8
-    bundle = Bundle(
+    bundle = BundleAdjustment(
         system,
         points_of(5),
         True,

@@ -163,7 +163,7 @@ BAD_MAPS = {
     "overlap with numbers": (MAP.replace('column = "C"', 'column = "A"', 1), "column A is table 1.y1 too"),
     "missing coordinate": (_without("y1"), "table 1 has no column y1"),
     "missing dimension": (_without("Td"), "no table has a column Td"),
-    "twice": (MAP + 'l = { column = "H", unit = "mm" }', "table 2.l is in table 1 too, expected each quantity once"),
+    "twice": (MAP + 'l = { column = "H", unit = "mm" }', "table 2.l is in table 1 too, expected it in one table"),
     "no sheet": (_without("sheet"), "table 1: has no sheet"),
     "no last row": (_without("last_row"), "table 1: has no last_row"),
     "row as text": (

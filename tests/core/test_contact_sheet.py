@@ -11,7 +11,7 @@ from PIL import Image
 
 import mphdrr.core as mph
 from mphdrr.core.cli import main
-from mphdrr.core.events.contact_sheet import ShownEvent, contact_sheet, drawn
+from mphdrr.core.events.contact_sheet import SheetRow, contact_sheet, draw_sheet
 from mphdrr.core.events.event_set import EventSet
 
 from .small_events import small_recipe
@@ -28,8 +28,8 @@ def texts(page, folder) -> list[str]:
     return re.findall(r"<text [^>]*>([^<]*)<", (folder / "sheet.svg").read_text(encoding="utf-8"))
 
 
-def shown(truth: np.ndarray, **more) -> ShownEvent:
-    return ShownEvent("Event 0", "", mph.Volume(truth, mph.Grid.centered(truth.shape, 2.0)), np.zeros(3), **more)
+def shown(truth: np.ndarray, **more) -> SheetRow:
+    return SheetRow("Event 0", "", mph.Volume(truth, mph.Grid.centered(truth.shape, 2.0)), np.zeros(3), **more)
 
 
 def test_the_sheet_says_what_the_events_are(events, tmp_path):
@@ -55,7 +55,7 @@ def test_slices_show_the_truth_upright():
     truth = np.zeros((32, 32, 32), np.float32)
     truth[16, 16, 16] = 1.0
     truth[24:28, 24:28, 15:18] = 1.0  # in the slice across z, right and above
-    picture = drawn([shown(truth)]).picture.astype(int).sum(axis=2)
+    picture = draw_sheet([shown(truth)]).picture.astype(int).sum(axis=2)
     bright = np.argwhere(picture > 650)
     side = 320
     top, left = picture.shape[0] - 50 - side, 44
@@ -66,16 +66,16 @@ def test_slices_show_the_truth_upright():
 
 
 def test_a_row_without_images_or_radon_has_slices_alone(tmp_path):
-    page = drawn([shown(np.ones((8, 8, 16), np.float32))])
+    page = draw_sheet([shown(np.ones((8, 8, 16), np.float32))])
     assert not any("views" in text or "Radon" in text for text in texts(page, tmp_path))
-    with_images = drawn([shown(np.ones((8, 8, 16), np.float32), model="m", images=np.ones((3, 4, 5), np.float32),
+    with_images = draw_sheet([shown(np.ones((8, 8, 16), np.float32), model="m", images=np.ones((3, 4, 5), np.float32),
                                rings=np.zeros(3, np.int64), unit="counts")])  # fmt: skip
     assert with_images.width > page.width
 
 
-def test_an_empty_event_can_be_drawn():
+def test_an_empty_event_can_be_draw_sheet():
     nothing = np.zeros((4, 4, 4), np.float32)
-    drawn(
+    draw_sheet(
         [shown(nothing, model="m", images=np.zeros((2, 4, 4), np.float32), rings=np.zeros(2, np.int64), radon=nothing)]
     )
 
@@ -83,7 +83,7 @@ def test_an_empty_event_can_be_drawn():
 @pytest.mark.parametrize("count", [0, 200])
 def test_too_few_and_too_many_events_are_refused(count):
     with pytest.raises(mph.InputError, match="contact sheet: expected 1 to"):
-        drawn([shown(np.ones((4, 4, 4), np.float32))] * count)
+        draw_sheet([shown(np.ones((4, 4, 4), np.float32))] * count)
 
 
 def test_the_command_draws_and_lists(events, tmp_path, capsys):
@@ -117,5 +117,5 @@ def test_wrong_calls_of_the_command_are_refused(events, tmp_path, capsys):
 
 def test_line_integrals_of_attenuation_have_no_unit(tmp_path):
     mu = mph.Volume(np.full((4, 4, 4), 0.02, np.float32), mph.Grid.centered(4, 5.0), "mu")
-    said = texts(drawn([ShownEvent("Event 0", "", mu, np.zeros(3), radon=np.full((2, 4, 4), 0.4))]), tmp_path)
+    said = texts(draw_sheet([SheetRow("Event 0", "", mu, np.zeros(3), radon=np.full((2, 4, 4), 0.4))]), tmp_path)
     assert "Truth, 0 to 0.02 1/mm" in said and "Radon, 2 angles, 0 to 0.4" in said

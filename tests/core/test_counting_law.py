@@ -57,7 +57,7 @@ def test_in_every_preset_points_maps_and_images_count_the_same(name, system):
 def test_in_every_preset_gradients_are_the_central_differences(name, system):
     """By a module's dimensions: of sensitivity, of performance at the isocentre, and of the total counts of a camera."""
     torch = pytest.importorskip("torch", reason="torch is not installed")
-    from mphdrr.core.projector.poses import emission_images
+    from mphdrr.core.projector.torch_cameras import emission_images
 
     one = system[4:5]
     model = emission(one, **{**PRESETS[name].model, "intrinsic_fwhm": 0.0, "hole": "point", "pixel_points": 3})
@@ -165,7 +165,7 @@ def test_performance_at_the_isocentre_is_differentiable_by_a_modules_dimensions(
 def test_cameras_of_tensors_count_as_the_model_with_the_same_optics(system):
     """Through cone, walls, edge and layers of modules with their own coefficients; their totals' gradients are right."""
     torch = pytest.importorskip("torch", reason="torch is not installed")
-    from mphdrr.core.projector.poses import emission_images
+    from mphdrr.core.projector.torch_cameras import emission_images
 
     two = system[4:6]
     own = {**REAL, "crystal_mu": [0.3, 0.1], "aperture_mu": [3.0, 1.2], "edge": "path", "depth_layers": 2}

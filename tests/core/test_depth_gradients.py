@@ -168,7 +168,7 @@ BY_DIRECTION = {"edge": "path", "crystal_mu": 0.3, "depth_layers": 2, "crystal_t
 def test_in_torch_all_numbers_have_gradients(settings, rng):
     """Gradcheck of the images by activity, mu, place, turn, l, d, pixels, the image's middle, time and penetration."""
     torch = pytest.importorskip("torch")
-    from mphdrr.core.projector.poses import emission_images
+    from mphdrr.core.projector.torch_cameras import emission_images
 
     grid, mu_grid = mph.Grid.centered((2, 2, 2), 12.0), mph.Grid.centered((2, 2, 2), 15.0)
     given = [
@@ -201,7 +201,7 @@ def test_in_torch_all_numbers_have_gradients(settings, rng):
 @pytest.mark.parametrize("settings", [{}, {"edge": "path", "plate_thickness": 4.0, "depth_layers": 2}])
 def test_in_torch_it_is_the_projector(settings, rng):
     torch = pytest.importorskip("torch")
-    from mphdrr.core.projector.poses import emission_images
+    from mphdrr.core.projector.torch_cameras import emission_images
 
     x, _ = numbers(rng)
     poses = torch.tensor(SYSTEM.poses())
@@ -215,7 +215,7 @@ def test_in_torch_it_is_the_projector(settings, rng):
 
 def test_in_torch_penetration_by_path_has_none():
     torch = pytest.importorskip("torch")
-    from mphdrr.core.projector.poses import emission_images
+    from mphdrr.core.projector.torch_cameras import emission_images
 
     volume = mph.Volume(np.ones((2, 2, 2)), mph.Grid.centered(2, 12.0), "activity")
     place = torch.tensor([0.7, 0.3, -80.0])

@@ -10,11 +10,19 @@ import pytest
 
 import mphdrr.core as mph
 from mphdrr.core.cli import main
-from mphdrr.core.design.numbers import rows_of
+from mphdrr.core.design.numbers import module_rows
 from mphdrr.core.design.objectives import Detail, Lesion, Regions, Sensitivity, ball_points
-from mphdrr.core.design.optimising import Loss
-from mphdrr.core.design.parameters import parameters, workbook
-from mphdrr.core.design.penalties import Clearance, CrystalArea, FieldOfView, Overlap, Sight, SmallestHole, faults
+from mphdrr.core.design.optimising import DesignLoss
+from mphdrr.core.design.parameters import displacement_parameters, free_parameters
+from mphdrr.core.design.penalties import (
+    Clearance,
+    CrystalArea,
+    FieldOfView,
+    LineOfSight,
+    ModuleSeparation,
+    SmallestHole,
+    faults,
+)
 from mphdrr.core.design.recipe import TEMPLATE
 from mphdrr.core.geometry.system import PinholeSystem
 from mphdrr.core.projector import Projector
@@ -35,7 +43,9 @@ def along(term, free, values, direction, step=1e-3) -> tuple[float, float]:
 def workbook_like(system: PinholeSystem):
     """Places, tilts, holes and lengths of all modules."""
     limits = {"radial": [-20, 20], "along": [-20, 20], "z": [-20, 20], "tilt": [-9, 9]}
-    return parameters("workbook", workbook(system), {**limits, "diameter": [0.5, 2], "longer": [0.5, 2]})
+    return free_parameters(
+        "workbook", displacement_parameters(system), {**limits, "diameter": [0.5, 2], "longer": [0.5, 2]}
+    )
 
 
 def model(system: PinholeSystem) -> mph.Emission:
@@ -57,8 +67,8 @@ def crowd(system: PinholeSystem) -> PinholeSystem:
         Detail(model, ball_points(30.0, 7), 9.0),
         Detail(model, ball_points(30.0, 7), 9.0, "gaussian"),
         FieldOfView(),
-        Overlap(),
-        Sight(),
+        ModuleSeparation(),
+        LineOfSight(),
         Clearance((150.0, 120.0, 5.0, 0.0)),
         SmallestHole(2.5),
         CrystalArea(120.0),
@@ -82,7 +92,7 @@ def test_a_row_of_numbers_is_all_that_generators_give(rng):
     free = small_design().parameters
     values = free.start + 0.1 * (free.high - free.low) * rng.uniform(-1, 1, len(free.start))
     direction = 0.01 * (free.high - free.low)
-    ahead, behind = (rows_of(free.build(values + sign * direction)) for sign in (1, -1))
+    ahead, behind = (module_rows(free.build(values + sign * direction)) for sign in (1, -1))
     assert free.jacobian(values) @ direction == pytest.approx((ahead - behind) / 2, rel=1e-3, abs=1e-4)
 
 
@@ -92,8 +102,8 @@ def one_module(b=200.0, l=50.0, d=3.0) -> PinholeSystem:
 
 def best_hole(objective, b=200.0, l=50.0) -> float:
     """The hole that the search finds."""
-    free = parameters("workbook", workbook(one_module(b, l)), {"diameter": [0.1, 5.0]})
-    loss = Loss(free, [(-1.0 / abs(objective(one_module(b, l))[0]), objective)])
+    free = free_parameters("workbook", displacement_parameters(one_module(b, l)), {"diameter": [0.1, 5.0]})
+    loss = DesignLoss(free, [(-1.0 / abs(objective(one_module(b, l))[0]), objective)])
     from scipy.optimize import minimize
 
     found = minimize(
@@ -127,7 +137,7 @@ def test_gradients_of_images_equal_differences(kind, worst, rng):
     def projector(system):
         return Projector(recipe.grid(), system.views((8, 8), "real"), recipe.model(system), double=True)
 
-    objective = replace(recipe.wanted()[0], projector_of=projector)
+    objective = replace(recipe.wanted()[0], make_projector=projector)
     free = recipe.parameters
     direction = rng.uniform(-1, 1, len(free.start)) * (free.high - free.low) / 1000
     exact, found = along(objective, free, free.start, direction, 1e-3)
@@ -196,7 +206,7 @@ def test_penalties_are_there_where_checks_find_faults(system):
     for crowded in (system, crowd(system)):
         report = mph.check_geometry(crowded)
         assert bool(FieldOfView(margin=0.0)(crowded)[0] > 1e-4) == bool(report.uncovered)
-        for penalty, findings in ((Overlap(), report.overlaps), (Sight(), report.blocked)):
+        for penalty, findings in ((ModuleSeparation(), report.overlaps), (LineOfSight(), report.blocked)):
             assert penalty(crowded)[0] > 0 or not findings
     assert faults(system, [SmallestHole(10.0)])[-1].endswith("too narrow")
     assert faults(system, [CrystalArea(1.0)])[-1].startswith("all modules")

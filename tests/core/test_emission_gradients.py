@@ -11,7 +11,7 @@ import mphdrr.core as mph  # noqa: E402
 from mphdrr.core.errors import InputError  # noqa: E402
 from mphdrr.core.geometry.rotations import se3_exp  # noqa: E402
 from mphdrr.core.physics.crystal import gaussian_blur  # noqa: E402
-from mphdrr.core.projector.poses import emission_images  # noqa: E402
+from mphdrr.core.projector.torch_cameras import emission_images  # noqa: E402
 
 from .conftest import BACKENDS, emission, general_grid, refused  # noqa: E402
 

@@ -109,8 +109,8 @@ def folder_for_event(folder: Path, others: Path) -> Path:
 
 DAMAGE = {
     cut: "cut: ", other_recipe: "of another recipe", changed_byte: "changed: its bytes", missing: "missing",
-    renamed: "it is event 0", header_byte: "changed: its first", foreign: "not of this set",
-    leftover: "interrupted", index: "changed: it is not what recipe.toml says",
+    renamed: "is event 0", header_byte: "changed: its first", foreign: "does not belong to this set",
+    leftover: "interrupted", index: "changed: its rows differ from those that recipe.toml gives",
     index_saved_elsewhere: "changed: ", index_cut_between_rows: "changed: ", index_of_no_text: "changed: ",
     foreign_event: "not in the index", folder_for_event: "",
 }  # fmt: skip

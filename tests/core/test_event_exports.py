@@ -34,7 +34,7 @@ def contents(folder: Path) -> dict[str, bytes]:
 def test_slots_of_the_users_scanner_are_96_of_which_columns_20_to_23_mirror_the_last_four(scanner):
     slots = row_slots(scanner)
     images = np.random.default_rng(1).random((80, 3, 5)).astype(np.float32)
-    arranged = slots.arranged(images)
+    arranged = slots.arrange(images)
     assert arranged.shape == (96, 3, 5)
     for row in range(4):
         for column in range(20):
@@ -274,23 +274,23 @@ def test_another_table_of_slots_is_another_export(event_set, tmp_path):
     export_events(event_set, tmp_path / "out", "3dunet", models="rays")
     export_events(event_set, tmp_path / "out", "3dunet", models="rays", slots=slots, raw="slots")
     slots.write_text(slots.read_text().replace(",1\n", ",0\n"))
-    with pytest.raises(InputError, match="another options"):
+    with pytest.raises(InputError, match="differs in options"):
         export_events(event_set, tmp_path / "out", "3dunet", models="rays", slots=slots)
 
 
 def test_folders_that_hold_something_else_are_refused(event_set, tmp_path):
     export_events(event_set, tmp_path / "out", "npz", models="rays")
     before = contents(tmp_path / "out")
-    with pytest.raises(InputError, match="another models"):
+    with pytest.raises(InputError, match="differs in models"):
         export_events(event_set, tmp_path / "out", "npz")
-    with pytest.raises(InputError, match="another program"):
+    with pytest.raises(InputError, match="differs in program"):
         export_events(event_set, tmp_path / "out", "webdataset", models="rays")
     with pytest.raises(InputError, match="other events"):
         export_events(event_set[1:], tmp_path / "out", "npz", models="rays")
     assert contents(tmp_path / "out") == before
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "notes.txt").write_text("mine")
-    with pytest.raises(InputError, match="expected a new folder"):
+    with pytest.raises(InputError, match="expected a new or empty folder"):
         export_events(event_set, tmp_path / "full", "npz")
 
 
@@ -299,7 +299,7 @@ def test_folders_that_hold_something_else_are_refused(event_set, tmp_path):
     [
         ({"models": "heart"}, "model 'heart': expected one of counts, rays"),
         ({"noise": -1}, "noise -1: expected own"),
-        ({"level": 0.5}, "level: it is of the noise"),
+        ({"level": 0.5}, "level: needs noise"),
         ({"models": "rays", "noise": 1}, "only counts and photons have it"),
         ({"raw": "slots"}, "npz: no option 'raw', it has none"),
     ],

@@ -8,7 +8,7 @@ import pytest
 import mphdrr.core as mph
 from mphdrr.core import events
 from mphdrr.core.events import event_files
-from mphdrr.core.events.event_files import Place
+from mphdrr.core.events.event_files import FileLocation
 from mphdrr.core.hdf5 import HEADER
 
 from .small_events import TEXT, WORKBOOK, small_recipe
@@ -102,21 +102,21 @@ def test_every_changed_byte_is_noticed(small, tmp_path):
     original = small[0].path.read_bytes()
     path = tmp_path / "event.h5"
     path.write_bytes(original)
-    assert event_files.verify(Place(str(path))) == event_files.header(Place(str(small[0].path)))
+    assert event_files.verify(FileLocation(str(path))) == event_files.read_header(FileLocation(str(small[0].path)))
     some = np.random.default_rng(0).integers(HEADER, len(original), 100).tolist()
     for place in (*range(HEADER), *some, len(original) - 1):
         changed = bytearray(original)
         changed[place] ^= 1 + place % 255
         path.write_bytes(changed)
         with pytest.raises(mph.InputError):
-            found = event_files.verify(Place(str(path)))
+            found = event_files.verify(FileLocation(str(path)))
             # the event and the recipe are no less than the rest what a file says of itself: the set knows better
             if (found.event, found.recipe) != (0, small.recipe.fingerprint):
                 raise mph.InputError("of another event or recipe")
     for changed in (original[:-1], original + b"\0", original[:100], b""):
         path.write_bytes(changed)
         with pytest.raises(mph.InputError):
-            event_files.verify(Place(str(path)))
+            event_files.verify(FileLocation(str(path)))
 
 
 def test_bytes_do_not_depend_on_threads_or_on_what_was_made_before(small):
@@ -129,5 +129,5 @@ def test_bytes_do_not_depend_on_threads_or_on_what_was_made_before(small):
     for threads in (1, 3):
         maker = events.EventMaker(recipe, threads)
         for number in (1, 0, 1):
-            packed = event_files.packed(maker.make(number), recipe, geometry, threads)
+            packed = event_files.pack(maker.make(number), recipe, geometry, threads)
             assert packed == small[number].path.read_bytes()

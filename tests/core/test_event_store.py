@@ -86,7 +86,7 @@ def test_a_set_with_shards_grows_in_them(whole, made):
     packed(whole)
     assert len(events.make(events.read_recipe(whole / "recipe.toml"), whole, COUNT + 2)) == COUNT + 2
     assert not list((whole / "events").iterdir())
-    assert len(Store(whole).places()) == COUNT + 2 and events.check(whole) == []
+    assert len(Store(whole).locations()) == COUNT + 2 and events.check(whole) == []
     assert_same_events_of_first(whole, made)
 
 
@@ -139,14 +139,14 @@ def test_a_kill_before_the_own_files_are_removed_packs_no_event_twice(whole, mad
 
 def test_damage_in_a_shard_is_found_and_mended(whole, made, capsys):
     store = packed(whole)
-    place = store.places()[3]
-    with open(place.path, "r+b") as file:
-        file.seek(place.offset + place.size // 2)
+    location = store.locations()[3]
+    with open(location.path, "r+b") as file:
+        file.seek(location.offset + location.size // 2)
         byte = file.read(1)
         file.seek(-1, os.SEEK_CUR)
         file.write(bytes([byte[0] ^ 4]))
     (fault,) = events.check(whole)
-    assert (fault.kind, fault.event, str(fault.path)) == ("damaged", 3, place.path)
+    assert (fault.kind, fault.event, str(fault.path)) == ("damaged", 3, location.path)
     assert main(["events", "check", str(whole), "--repair"]) == 0
     assert_same_events(whole, made)
     assert events.check(whole) == []
@@ -185,7 +185,7 @@ def test_a_set_of_an_earlier_version_opens_and_goes_on(whole, made):
     (whole / "events" / "000004.h5").unlink()
     with pytest.warns(mph.InputWarning, match=r"another build of mphDRR \(of version 0\.1"):
         events.make(events.read_recipe(whole / "recipe.toml"), whole, COUNT + 1)
-    assert events.check(whole) == [] and SetFolder(whole).asked == [range(COUNT + 1)]
+    assert events.check(whole) == [] and SetFolder(whole).requested == [range(COUNT + 1)]
     packed(whole)
     assert_same_events_of_first(whole, made)
     data = bytearray((whole / "shards" / "000000.tar").read_bytes())
@@ -200,7 +200,7 @@ def test_two_works_pack_one_after_the_other(whole):
     store.shards.mkdir()
     with (
         files.locked(store.shards / stores.LOCK, "busy"),
-        pytest.raises(mph.InputError, match="another work is packing"),
+        pytest.raises(mph.InputError, match="another process is packing"),
     ):
         store.pack()
     assert store.pack() == COUNT
@@ -276,12 +276,12 @@ def test_works_that_grow_a_set_at_once_lose_no_rows(tmp_path):
     lines = (tmp_path / "set" / "index.csv").read_text().splitlines()
     assert [line.split(",")[0] for line in lines] == ["event", *map(str, range(12))]
     folder = SetFolder(tmp_path / "set")
-    assert folder.asked == [range(12)] and events.check(folder.path) == []
+    assert folder.requested == [range(12)] and events.check(folder.path) == []
     for name in ("0-3", "2-9"):  # as of works that asked at one time
-        (folder.asked_path / name).touch()
-    assert folder.asked == [range(12)] and events.check(folder.path) == []
+        (folder.requests_path / name).touch()
+    assert folder.requested == [range(12)] and events.check(folder.path) == []
     events.make(recipe, folder.path, 12)
-    assert [path.name for path in folder.asked_path.iterdir()] == ["0-11"]
+    assert [path.name for path in folder.requests_path.iterdir()] == ["0-11"]
 
 
 @pytest.mark.parametrize("kept", [0, 5, 14])
@@ -364,7 +364,7 @@ def linked(file) -> None:
     ("change", "edit", "said"),
     [
         (edited, lambda file: file["pose"].__setitem__((0, 3), 99.0), "c(ut|hanged): "),
-        (sealed_again, other_shape, r"images/lines of shape \(8, 14, 17\), the recipe says \(8, 14, 16\)"),
+        (sealed_again, other_shape, r"images/lines: expected the shape \(8, 14, 16\), got \(8, 14, 17\)"),
         (sealed_again, external, "its numbers are in other files"),
         (sealed_again, linked, "a link to another file"),
     ],
@@ -432,4 +432,4 @@ def test_sets_without_ends_are_refused_or_begin_at_once(tmp_path, capsys):
     begun = time.process_time()
     assert next(events.making(recipe, tmp_path / "set", 10**6, shard=(7, 50))).number == 6
     assert time.process_time() - begun < 20
-    assert SetFolder(tmp_path / "set").asked == [range(10**6)]
+    assert SetFolder(tmp_path / "set").requested == [range(10**6)]

@@ -161,7 +161,7 @@ def test_datasets_pickle(event_set):
         ({"fields": ("counts",), "crop": 4}, "crop: 'truth': expected one of the fields"),
         ({"fields": ("counts", "radon6"), "crop": {("counts", "radon6"): 4}}, "expected fields of one shape"),
         ({"fields": ("rays",), "noise": "own"}, "only counts and photons have it"),
-        ({"fields": ("counts",), "levels": 0.5}, "levels: they are of the noise"),
+        ({"fields": ("counts",), "levels": 0.5}, "levels: need noise"),
         ({"fields": ("counts",), "noise": "each"}, "noise 'each'"),
         ({"fields": ("truth",), "seed": -1}, "seed: expected a whole number"),
     ],

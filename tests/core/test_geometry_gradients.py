@@ -10,8 +10,9 @@ torch = pytest.importorskip("torch", reason="torch is not installed")
 from mphdrr.core.errors import InputError  # noqa: E402
 from mphdrr.core.geometry.grid import Grid  # noqa: E402
 from mphdrr.core.geometry.views import Views  # noqa: E402
-from mphdrr.core.projector import Projector, execution, trace_rays  # noqa: E402
-from mphdrr.core.projector.tracing import trace_fans  # noqa: E402
+from mphdrr.core.projector import Projector, trace_rays  # noqa: E402
+from mphdrr.core.rays import execution  # noqa: E402
+from mphdrr.core.rays.tracing import trace_fans  # noqa: E402
 from mphdrr.core.volumes.volume import Volume  # noqa: E402
 
 from .conftest import BACKENDS, general_grid, refused, same_matter  # noqa: E402

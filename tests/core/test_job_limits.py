@@ -14,8 +14,8 @@ from pathlib import Path
 import pytest
 
 from mphdrr.core import memory
-from mphdrr.core.events.pool import threads_each
-from mphdrr.core.projector.parallel import thread_count
+from mphdrr.core.events.pool import threads_per_worker
+from mphdrr.core.rays.parallel import thread_count
 
 from .conftest import WORKBOOK, refused, run_python
 
@@ -95,7 +95,7 @@ def test_a_share_of_the_processors_time_is_rounded_up_to_cores(job, monkeypatch,
     groups(job, "0::/a/b\n", VERSION_2)
     files(job / "a", cpu__max=quota)
     assert memory.cores() == thread_count(None) == (cores or 64)
-    assert [threads_each(n) for n in (1, 2, 100)] == [cores or 64, max(1, (cores or 64) // 2), 1]
+    assert [threads_per_worker(n) for n in (1, 2, 100)] == [cores or 64, max(1, (cores or 64) // 2), 1]
 
 
 @pytest.mark.parametrize("quota, cores", [("-1", 6), ("250000", 3), ("900000", 6)])
@@ -221,7 +221,7 @@ def test_a_job_with_half_the_memory_that_it_needs_says_so_in_one_line_and_leaves
 def test_tasks_that_have_tasks_end():
     """Each task of as many as there are threads asks the same threads for more, as reconstructions of several events do."""
     code = (
-        "from mphdrr.core.projector.parallel import in_order\n"
+        "from mphdrr.core.rays.parallel import in_order\n"
         "outer = lambda i: sum(in_order(lambda j: i * j, range(50), 2))\n"
         "print(list(in_order(outer, range(20), 2)))"
     )

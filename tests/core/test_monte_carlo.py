@@ -20,7 +20,7 @@ import pytest
 
 from mphdrr.core import ISOTOPES, DerenzoPhantom, PinholeSystem, euler_pose
 from mphdrr.core.exchange import FORMATS, write_geometry
-from mphdrr.core.exchange.gate9 import MOST_LINES, angle_and_axis
+from mphdrr.core.exchange.gate9 import MAX_LINES, angle_and_axis
 
 from .conftest import refused
 
@@ -111,7 +111,7 @@ class Macros:
 
     def _execute(self, path: Path) -> None:
         lines = path.read_text().splitlines()
-        assert len(lines) <= MOST_LINES, path
+        assert len(lines) <= MAX_LINES, path
         for line in lines:
             if line.startswith("#"):
                 continue
@@ -259,7 +259,7 @@ def test_heads_on_the_axes(tmp_path) -> None:
 
 
 def test_a_scanner_of_many_kinds_of_module_has_no_long_macro(tmp_path) -> None:
-    n = 2 * MOST_LINES + 30
+    n = 2 * MAX_LINES + 30
     angles = np.linspace(0, 2 * np.pi, n, endpoint=False)
     centers = np.stack([900 * np.cos(angles), 900 * np.sin(angles), np.zeros(n)], axis=1)
     many = PinholeSystem(centers, 2.0, np.linspace(50, 60, n), np.linspace(10, 12, n), 5.0, 75.0)

@@ -5,8 +5,8 @@ import pytest
 
 import mphdrr.core as mph
 from mphdrr.core.exchange import FORMATS
-from mphdrr.core.projector import backends
-from mphdrr.core.projector.rays import view_rays, window
+from mphdrr.core.rays import backends
+from mphdrr.core.rays.ray_geometry import view_rays, window
 
 from .conftest import refused
 from .odd_views import moved_views

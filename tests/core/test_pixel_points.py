@@ -9,7 +9,7 @@ import pytest
 
 import mphdrr.core as mph
 from mphdrr.core.errors import InputWarning
-from mphdrr.core.projector.pixel_points import expected_error, lattice, offsets, points_needed, shadow_edges
+from mphdrr.core.models.pixel_points import expected_error, lattice, offsets, points_needed, shadow_edges
 
 from .conftest import WORKBOOK, general_grid, refused
 from .test_emission import BACKENDS, assert_adjoint, assert_real_is_virtual, in_ball, one_module, turned_grid

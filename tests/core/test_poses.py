@@ -8,7 +8,7 @@ import pytest
 torch = pytest.importorskip("torch", reason="torch is not installed")
 
 from mphdrr.core.projector import Projector  # noqa: E402
-from mphdrr.core.projector.poses import pinhole_images, pinhole_rays  # noqa: E402
+from mphdrr.core.projector.torch_cameras import pinhole_images, pinhole_rays  # noqa: E402
 from mphdrr.core.volumes.volume import Volume  # noqa: E402
 
 from .conftest import BACKENDS, general_grid, refused  # noqa: E402

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import os
 import warnings
 
@@ -14,8 +15,9 @@ from mphdrr.core.errors import InputError, InputWarning
 from mphdrr.core.geometry.grid import Grid
 from mphdrr.core.geometry.views import Views
 from mphdrr.core.progress import Cancelled
-from mphdrr.core.projector import Projector, Transmission, backends, trace_rays
-from mphdrr.core.projector.backends import cpu
+from mphdrr.core.projector import Projector, Transmission, trace_rays
+from mphdrr.core.rays import backends
+from mphdrr.core.rays.backends import cpu
 from mphdrr.core.volumes.volume import Volume
 
 from .conftest import WORKBOOK, emission, refused, run_python
@@ -186,7 +188,7 @@ def test_rays_that_cannot_fit_are_refused_before_they_are_made():
 def test_adjoint_uses_fewer_threads_when_memory_is_short(monkeypatch):
     images = np.random.default_rng(0).random((2, 6, 7))
     expected = Projector(GRID, VIEWS, threads=1).T(images)
-    monkeypatch.setattr("mphdrr.core.projector.execution.available", lambda: 1)
+    monkeypatch.setattr("mphdrr.core.rays.execution.available", lambda: 1)
     np.testing.assert_array_equal(Projector(GRID, VIEWS, threads=4).T(images), expected)
 
 
@@ -245,3 +247,22 @@ def test_images_do_not_depend_on_threads_where_they_are_attenuated():
         Projector(GRID, system.views((72, 72)), emission(system, mu), threads=threads)(ONES) for threads in (1, 6)
     )
     np.testing.assert_array_equal(first, second)
+
+
+@pytest.mark.parametrize(
+    ("path", "name", "new"),
+    [
+        ("backends", "BACKENDS", "rays.backends"),
+        ("backends.cpu", "levels", "rays.backends.cpu"),
+        ("emission", "Emission", "models.emission"),
+        ("models", "Transmission", "models.model"),
+        ("parallel", "thread_count", "rays.parallel"),
+        ("rays", "view_rays", "rays.ray_geometry"),
+    ],
+)
+def test_old_paths_of_modules_give_the_same_names_and_say_the_new_path(path, name, new):
+    old = importlib.import_module(f"mphdrr.core.projector.{path}")
+    words = f"mphdrr.core.projector.{path} is deprecated: import {name} from mphdrr.core.{new}"
+    with pytest.warns(DeprecationWarning, match=f"^{words}$"):
+        value = getattr(old, name)
+    assert value is getattr(importlib.import_module(f"mphdrr.core.{new}"), name)

@@ -16,10 +16,11 @@ import warp
 
 from mphdrr.core.geometry.grid import Grid
 from mphdrr.core.geometry.views import Views
-from mphdrr.core.projector import Projector, backends
+from mphdrr.core.projector import Projector
 from mphdrr.core.projector import trace_rays as trace
-from mphdrr.core.projector.backends import cuda, reference
-from mphdrr.core.projector.rays import Attenuation, IndexFans, IndexRays, index_fans, view_rays
+from mphdrr.core.rays import backends
+from mphdrr.core.rays.backends import cuda, reference
+from mphdrr.core.rays.ray_geometry import Attenuation, IndexFans, IndexRays, index_fans, view_rays
 from mphdrr.core.volumes.volume import Volume
 
 from .conftest import emission, general_grid, refused
@@ -313,7 +314,7 @@ def test_short_memory_means_more_launches(monkeypatch, rng):
 @pytest.mark.long
 @pytest.mark.skipif(sys.platform == "darwin", reason="Warp has no CUDA on macOS")
 def test_kernels_compile_for_gpus_without_one(tmp_path):
-    from mphdrr.core.projector.backends import warp_kernels
+    from mphdrr.core.rays.backends import warp_kernels
 
     cuda.device()
     (compiled,) = warp.compile_aot_module(warp_kernels, arch=75, module_dir=tmp_path, use_ptx=True)
@@ -331,7 +332,7 @@ def test_volume_too_large_for_the_device_is_refused(monkeypatch, rng):
 def test_gradients_are_those_of_the_reference(same, system, rng):
     """For rays by volume, mu and ends; for a projector by volume and mu; for cameras by their parameters."""
     torch = pytest.importorskip("torch", reason="torch is not installed")
-    from mphdrr.core.projector.poses import emission_images
+    from mphdrr.core.projector.torch_cameras import emission_images
 
     grid = general_grid(rng, (12, 9, 10))
     mu_grid = grid if same else general_grid(rng, (9, 10, 8))

@@ -11,7 +11,7 @@ import mphdrr.core as mph
 from mphdrr.core.cli import main
 from mphdrr.core.errors import InputError
 from mphdrr.core.physics.ct_numbers import diffdrr_density
-from mphdrr.core.projector.tracing import trace_fans
+from mphdrr.core.rays.tracing import trace_fans
 from mphdrr.core.runs.projecting import project_run
 from mphdrr.core.volumes.volume import UNITS
 from mphdrr.core.volumes.volume_files import write_volume
@@ -38,10 +38,10 @@ def _fans(volume, mu=None):
 def _poses(name, **settings):
     def use(volume):
         torch = pytest.importorskip("torch")
-        from mphdrr.core.projector import poses
+        from mphdrr.core.projector import torch_cameras
 
         position = torch.tensor([0.0, 0.0, -200.0])
-        return getattr(poses, name)(volume, position, torch.eye(3), 60.0, 1.5, (4, 4), **settings)
+        return getattr(torch_cameras, name)(volume, position, torch.eye(3), 60.0, 1.5, (4, 4), **settings)
 
     return use
 

@@ -12,10 +12,10 @@ import pytest
 torch = pytest.importorskip("torch", reason="torch is not installed")
 pytest.importorskip("roma", reason="roma is not installed")
 
+from mphdrr.core.exchange.diffdrr.pose_search import local_ncc, multiscale_ncc, ncc, pose_error, register_pose  # noqa: E402
 from mphdrr.core.geometry.grid import Grid  # noqa: E402
 from mphdrr.core.geometry.rotations import pose_matrix, se3_exp  # noqa: E402
-from mphdrr.core.projector.pose_search import local_ncc, multiscale_ncc, ncc, pose_error, register_pose  # noqa: E402
-from mphdrr.core.projector.poses import pinhole_images  # noqa: E402
+from mphdrr.core.projector.torch_cameras import pinhole_images  # noqa: E402
 from mphdrr.core.volumes.volume import Volume  # noqa: E402
 
 from .conftest import refused  # noqa: E402

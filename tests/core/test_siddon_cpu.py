@@ -12,9 +12,9 @@ import pytest
 
 from mphdrr.core.errors import InputError
 from mphdrr.core.geometry.grid import Grid
-from mphdrr.core.projector.backends import cpu, reference
-from mphdrr.core.projector.lattices import Lattices
-from mphdrr.core.projector.rays import index_fans, index_rays, view_rays
+from mphdrr.core.rays.backends import cpu, reference
+from mphdrr.core.rays.lattices import Lattices
+from mphdrr.core.rays.ray_geometry import index_fans, index_rays, view_rays
 
 from .conftest import run_python
 from .test_projector import LINEAR, SHAPES, affine, nasty_rays, random_rays, some_views
@@ -88,7 +88,7 @@ def test_no_rays():
     assert cpu.derivatives(np.ones((4, 4, 4)), *mapped).shape == (0, 7)
 
 
-PRINT_LEVEL = "from mphdrr.core.projector.backends import cpu; print(cpu.levels()[cpu.level])"
+PRINT_LEVEL = "from mphdrr.core.rays.backends import cpu; print(cpu.levels()[cpu.level])"
 
 
 @pytest.mark.parametrize("name", LEVELS)
@@ -110,7 +110,7 @@ def test_the_library_is_the_packages_own(tmp_path):
     paths = dict.fromkeys(
         ("LD_LIBRARY_PATH", "DYLD_LIBRARY_PATH", "PATH"), f"{tmp_path}{os.pathsep}{os.environ['PATH']}"
     )
-    done = run_python("from mphdrr.core.projector.backends import cpu; print(cpu._library._name)", paths, cwd=tmp_path)
+    done = run_python("from mphdrr.core.rays.backends import cpu; print(cpu.library._name)", paths, cwd=tmp_path)
     assert Path(done.stdout.strip()).parent == Path(cpu.__file__).with_name("kernels"), done.stderr
 
 

@@ -10,8 +10,8 @@ import pytest
 
 import mphdrr.core as mph
 from mphdrr.core.geometry.collimator import Collimator, Construction
+from mphdrr.core.models.wall_penetration import models_with_walls
 from mphdrr.core.physics.aperture import disk_points
-from mphdrr.core.projector.wall_penetration import models_with_walls
 
 from .conftest import WORKBOOK, refused
 
@@ -129,7 +129,7 @@ def traced(system, place, size, points, areas, of_hole, rng):
 def test_photons_one_by_one_through_a_neighbours_hole(rng):
     system, size, n = two_modules(), 6.0, 2**20
     place, (_, through) = seen_through_neighbour(system), beside_and_through(system)
-    radius, (u, v, _) = through.whole.effective_diameter[1] / 2, system.frames()[1]
+    radius, (u, v, _) = through.scanner.effective_diameter[1] / 2, system.frames()[1]
     angle, r = 2 * math.pi * rng.random(n), radius * np.sqrt(rng.random(n))
     points = system.centers[1] + (r * np.cos(angle))[:, None] * u + (r * np.sin(angle))[:, None] * v
     mean, sd = traced(system, place, size, points, math.pi * radius**2, True, rng)

@@ -26,8 +26,8 @@ from mphdrr.core.geometry.design_formulas import collimator_length
 from mphdrr.core.geometry.pinhole_columns import PINHOLE_COLUMNS
 from mphdrr.core.workbook import read_system
 from mphdrr.core.workbook.agreement import tolerance
-from mphdrr.core.workbook.formulas import CellError, NotComputable, Surroundings, calculate
-from mphdrr.core.workbook.headings import vocabulary
+from mphdrr.core.workbook.formulas import CellError, FormulaContext, NotComputable, calculate
+from mphdrr.core.workbook.headings import get_vocabulary
 
 from . import libreoffice
 
@@ -566,7 +566,7 @@ def test_formulas_give_what_a_spreadsheet_shows(formula, value):
     def lookup(sheet, row, column):
         return cells.get((sheet, row, column))
 
-    found = calculate(formula, Surroundings(lookup))
+    found = calculate(formula, FormulaContext(lookup))
     assert found == (value if isinstance(value, str) else pytest.approx(value, rel=1e-14))
 
 
@@ -590,7 +590,7 @@ def test_counts_of_errors_are_those_of_libreoffice():
     known = {coordinate_to_tuple(cell): value for cell, value in cells.items()}
     known |= {(2, 1): CellError("#DIV/0!"), (4, 1): ""}
     for i, formula in enumerate(formulas, start=1):
-        found = calculate(f"={formula}", Surroundings(lambda sheet, row, column: known.get((row, column))))
+        found = calculate(f"={formula}", FormulaContext(lambda sheet, row, column: known.get((row, column))))
         assert found == theirs[f"D{i}"].value, formula
 
 
@@ -599,7 +599,7 @@ def test_counts_of_errors_are_those_of_libreoffice():
 )
 def test_formulas_beyond_arithmetic_are_not_computed(formula):
     with pytest.raises(NotComputable):
-        calculate(formula, Surroundings(lambda *_: 1.0))
+        calculate(formula, FormulaContext(lambda *_: 1.0))
 
 
 @pytest.mark.parametrize(
@@ -619,7 +619,7 @@ def test_formulas_beyond_arithmetic_are_not_computed(formula):
     ],
 )
 def test_headings_name_quantities(heading, quantity):
-    assert (vocabulary(PINHOLE_COLUMNS).heading_of(heading) or (None,))[0] == quantity
+    assert (get_vocabulary(PINHOLE_COLUMNS).parse_heading(heading) or (None,))[0] == quantity
 
 
 # Refusals

@@ -21,13 +21,15 @@ import mphdrr.core as mph
 from mphdrr.core.errors import InputError, InputWarning
 from mphdrr.core.geometry.columns import LENGTH_UNITS
 from mphdrr.core.geometry.pinhole_columns import PINHOLE_COLUMNS
-from mphdrr.core.workbook.headings import Heading, vocabulary
+from mphdrr.core.workbook.headings import Heading, get_vocabulary
 
 from .test_workbook import _one_sheet, assert_plain, plain, read_edited, saved
 from .test_workbook import _typed as typed
 from .workbooks import DIMENSIONS, by_design
 
 pytestmark = pytest.mark.filterwarnings("error")
+
+parse_heading = get_vocabulary(PINHOLE_COLUMNS).parse_heading
 
 Edit = Callable[[Worksheet, Worksheet], object]
 
@@ -367,8 +369,8 @@ def test_what_is_understood_is_read(kind, tmp_path):
 def test_units_are_understood_in_every_form(form, unit):
     named = {"CM": "cm", "inches": "in", "centimetres": "cm", "μm": "µm"}
     for name in ("x1", "Ld", "R", "l"):
-        assert vocabulary(PINHOLE_COLUMNS).heading_of(form.format(name, unit)) == Heading(name, named.get(unit, unit))
-    assert vocabulary(PINHOLE_COLUMNS).heading_of(form.format("pinhole azimuth", unit)) is None
+        assert parse_heading(form.format(name, unit)) == Heading(name, named.get(unit, unit))
+    assert parse_heading(form.format("pinhole azimuth", unit)) is None
 
 
 def in_units(units: dict[str, str]):
@@ -379,7 +381,7 @@ def in_units(units: dict[str, str]):
         for sheet in (main, coordinates):
             for column in range(2, sheet.max_column + 1):
                 heading = next(
-                    (h for r in (1, 2) if (h := vocabulary(PINHOLE_COLUMNS).heading_of(sheet.cell(r, column).value))),
+                    (h for r in (1, 2) if (h := parse_heading(sheet.cell(r, column).value))),
                     None,
                 )
                 if heading is None or PINHOLE_COLUMNS[heading.name].kind != "length":
@@ -433,7 +435,7 @@ def test_a_row_of_units_counts(tmp_path):
             for column in range(2, sheet.max_column + 1):
                 for row in (1, 2):
                     if (
-                        heading := vocabulary(PINHOLE_COLUMNS).heading_of(sheet.cell(row, column).value or "")
+                        heading := parse_heading(sheet.cell(row, column).value or "")
                     ) is not None and heading.unit == "cm":
                         sheet.cell(row, column).value = sheet.cell(row, column).value.rstrip("(cm)[], ")
                         sheet.cell(3, column).value = "[cm]"

@@ -268,7 +268,7 @@ def test_values_in_a_new_workbook_are_those_of_its_formulas(system, tmp_path):
     odd = replace(odd, collimator_length=odd.collimator_length * np.where(np.arange(len(odd)) == 5, 1.25, 1))
     written = mph.write_system(odd, tmp_path / "new.xlsx")
     book = Book(written.path)
-    formulas = {book.workbook.text(place): (place, cell) for place, cell in book.workbook.formulas.items()}
+    formulas = {book.workbook.address_text(place): (place, cell) for place, cell in book.workbook.formulas.items()}
     assert written.recalculated == {name: cell.value for name, (_, cell) in formulas.items()}
     for name, (place, cell) in formulas.items():
         computed = book.calculation.value(place)

@@ -3,7 +3,7 @@
 // A job is its kind, its level, and what the function of that kind reads: numbers and arrays, each padded to 8 bytes.
 // test_kernels.py writes and reads the files.
 
-#include "../../core/projector/backends/kernels/kernels.h"
+#include "../../core/rays/backends/kernels/kernels.h"
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from mphdrr.core.perspective.places import LEAST, PRODUCT, SUM, _gather_in_numpy, _scatter_in_numpy, _stencils
-from mphdrr.core.projector.backends.cpu import _PlacesJob
+from mphdrr.core.rays.backends.cpu import PlacesJob
 
 from .jobs import BAD, Array, Made, Read, close, packed
 
@@ -123,7 +123,7 @@ def _job(rng: np.random.Generator, number: int) -> Made:
             numbers[rng.random(numbers.shape) < 0.3] = rng.choice([np.nan, np.inf])
     elif gives and rng.random() < 0.7:
         points[doubtful] = 0
-    struct = _PlacesJob(
+    struct = PlacesJob(
         is_double=kind == np.float64, how=how, flat=flat, by_depth=by_depth, n=tuple(n.tolist()), first=int(first),
         last=int(last), middle=middle, nearest=nearest, arrays=arrays, m=tuple(m.tolist()), seen=seen or None,
         exponents=exponents or None,

@@ -19,9 +19,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mphdrr.core.projector.backends import reference
-from mphdrr.core.projector.backends.cpu import _fans
-from mphdrr.core.projector.rays import Attenuation, IndexFans, IndexRays
+from mphdrr.core.rays.backends import reference
+from mphdrr.core.rays.backends.cpu import _fans
+from mphdrr.core.rays.ray_geometry import Attenuation, IndexFans, IndexRays
 
 from .jobs import Made, Read, close, packed
 from .places_jobs import places_jobs

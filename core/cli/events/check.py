@@ -1,4 +1,4 @@
-"""``mphdrr events check SET``."""
+"""Action ``mphdrr events check SET``: every byte of an event set, and its repair."""
 
 import argparse
 import time
@@ -6,16 +6,16 @@ from dataclasses import asdict
 
 from ... import events
 from ...errors import InputError
-from ..options import counted, print_answer, progress_bar, say
+from ..options import count_text, print_answer, progress_bar, say
 from .action import add_action
-from .make import watched
+from .make import run_with_reports
 
-_TIMES, _SECONDS = 10, 0.5
-"""How often, and after which time, an index is looked at again that is not in order."""
+_MAX_CHECKS, _CHECK_INTERVAL = 10, 0.5
+"""Largest number of checks of a faulty index, and the time between two of them, s."""
 
 
 def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
-    """Add the action."""
+    """Add the action ``events check``."""
     parser = add_action(actions, "check", _run)
     text = "make missing and damaged events anew; foreign files move to the folder SET-foreign; the rest is not touched"
     parser.add_argument("--repair", action="store_true", help=text)
@@ -23,8 +23,7 @@ def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
 
 
 def _run(arguments: argparse.Namespace) -> None:
-    """Read every byte of a set and say what is wrong: events that are missing, cut, changed or of another recipe, and
-    foreign files.
+    """List the faults of a set: events that are missing, cut, changed or of another recipe, and foreign files.
 
     mphdrr events check set
     mphdrr events check set --repair --workers 2
@@ -39,24 +38,24 @@ def _run(arguments: argparse.Namespace) -> None:
     record = [{**asdict(fault), "path": str(fault.path)} for fault in faults]
     if not arguments.repair or not faults:
         if not faults:
-            lines = [f"{folder}: {sum(map(len, SetFolder(folder).asked))} events, every byte as it was written"]
+            lines = [f"{folder}: {sum(map(len, SetFolder(folder).requested))} events, every byte as it was written"]
         print_answer(arguments, record, lines)
         if faults:
-            raise InputError(f"{folder}: {counted(len(faults), 'fault')}; --repair mends what can be mended")
+            raise InputError(f"{folder}: {count_text(len(faults), 'fault')}; --repair mends what can be mended")
         return
     for line in lines:
         say(line)
-    again = events.repair(folder, faults)
-    done = watched(Making(SetFolder(folder), again, arguments.workers), quiet=True)
-    left = events.check(folder, progress_bar("checking again"))
-    for _ in range(_TIMES):  # another work that ends now may be writing it
-        if {fault.kind for fault in left} != {"index"}:
+    missing_again = events.repair(folder, faults)
+    n_made = run_with_reports(Making(SetFolder(folder), missing_again, arguments.workers), quiet=True)
+    remaining = events.check(folder, progress_bar("checking again"))
+    for _ in range(_MAX_CHECKS):  # another process that ends now may be writing the index
+        if {fault.kind for fault in remaining} != {"index"}:
             break
-        time.sleep(_SECONDS)
-        events.repair(folder, left)
-        left = index_faults(folder)
-    record = [{**asdict(fault), "path": str(fault.path)} for fault in left]
-    mended = f"{folder}: {counted(len(faults), 'fault')} mended, {done} events made anew"
-    print_answer(arguments, record, [fault.text for fault in left] or [mended])
-    if left:
-        raise InputError(f"{folder}: {len(left)} of its faults are left")
+        time.sleep(_CHECK_INTERVAL)
+        events.repair(folder, remaining)
+        remaining = index_faults(folder)
+    record = [{**asdict(fault), "path": str(fault.path)} for fault in remaining]
+    mended = f"{folder}: {count_text(len(faults), 'fault')} mended, {n_made} events made anew"
+    print_answer(arguments, record, [fault.text for fault in remaining] or [mended])
+    if remaining:
+        raise InputError(f"{folder}: {len(remaining)} of its faults are left")

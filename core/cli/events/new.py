@@ -1,4 +1,4 @@
-"""``mphdrr events new --like derenzo``."""
+"""Action ``mphdrr events new --like derenzo``: a recipe to start from."""
 
 import argparse
 import os
@@ -12,11 +12,11 @@ from ..options import add_run, new_recipe_path, print_answer
 
 
 def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
-    """Add the action."""
+    """Add the action ``events new``."""
     parser = add_run(actions, "new", _run)
     add = parser.add_argument
     add("--like", choices=tuple(TEMPLATES), default="derenzo", metavar="NAME", help="see the list below")
-    add("--system", metavar="FILE", help="the scanner's geometry workbook; default: that of the examples")
+    add("--system", metavar="FILE", help="the scanner's geometry workbook; default: the example")
     add("-o", "--output", metavar="FILE", help="a new file (.toml); default: standard output")
     add("--json", action="store_true", help="print the recipe and its file as JSON")
     names = "\n".join(f"  {name:<13}{text}" for name, text in TEMPLATES.items())
@@ -24,7 +24,7 @@ def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
 
 
 def _run(arguments: argparse.Namespace) -> None:
-    """Write a commented recipe to begin with.
+    """Write a commented recipe to start from.
 
     mphdrr events new --like derenzo --system scanner.xlsx -o derenzo.toml
     """
@@ -36,14 +36,17 @@ def _run(arguments: argparse.Namespace) -> None:
         print_answer(arguments, {"file": None, "recipe": text}, [text.removesuffix("\n")])
         return
     path = new_recipe_path(arguments.output)
-    text = template_text(arguments.like, _seen_from(path.parent, workbook))
+    text = template_text(arguments.like, _path_for_recipe(path.parent, workbook))
     write_bytes(path, text.encode())
     advice = f"{path}: edit it, then: mphdrr events make SET --recipe {path} -n 1000"
     print_answer(arguments, {"file": str(path), "recipe": text}, [advice])
 
 
-def _seen_from(folder: Path, workbook: Path) -> str:
-    """A workbook's path relative to a folder, with / on every system; absolute for the example, or on another drive."""
+def _path_for_recipe(folder: Path, workbook: Path) -> str:
+    """Return a workbook's path for a recipe in `folder`: relative, with / on every system.
+
+    The example's path, and one on another drive, is absolute.
+    """
     if workbook == EXAMPLE:
         return workbook.as_posix()
     try:

@@ -1,10 +1,10 @@
-"""``mphdrr events pack SET`` and ``mphdrr events unpack SET``."""
+"""Actions ``mphdrr events pack SET`` and ``mphdrr events unpack SET``: events in shards, or in files of their own."""
 
 import argparse
 from typing import TYPE_CHECKING
 
 from ...validation import positive
-from ..options import counted, print_answer, progress_bar
+from ..options import count_text, print_answer, progress_bar
 from .action import add_action
 
 if TYPE_CHECKING:
@@ -12,9 +12,9 @@ if TYPE_CHECKING:
 
 
 def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
-    """Add both actions."""
+    """Add the actions ``events pack`` and ``events unpack``."""
     pack = add_action(actions, "pack", _pack)
-    pack.add_argument("--gigabytes", type=float, default=1.0, metavar="N", help="size of a shard, about")
+    pack.add_argument("--gigabytes", type=float, default=1.0, metavar="N", help="approximate size of a shard")
     add_action(actions, "unpack", _unpack)
 
 
@@ -23,10 +23,10 @@ def _pack(arguments: argparse.Namespace) -> None:
 
     mphdrr events pack set
     """
-    store, size = _set(arguments).store, positive(arguments.gigabytes, "--gigabytes") * 1e9
-    done = store.pack(progress_bar("packing"), int(size))
-    shards = counted(len(store.shard_paths()), "shard")
-    print_answer(arguments, {"packed": done}, [f"{arguments.folder}: {done} events packed, {shards}"])
+    store, size = _open_folder(arguments).store, positive(arguments.gigabytes, "--gigabytes") * 1e9
+    n_packed = store.pack(progress_bar("packing"), int(size))
+    shards = count_text(len(store.shard_paths()), "shard")
+    print_answer(arguments, {"packed": n_packed}, [f"{arguments.folder}: {n_packed} events packed, {shards}"])
 
 
 def _unpack(arguments: argparse.Namespace) -> None:
@@ -34,13 +34,14 @@ def _unpack(arguments: argparse.Namespace) -> None:
 
     mphdrr events unpack set
     """
-    done = _set(arguments).store.unpack(progress_bar("unpacking"))
-    print_answer(arguments, {"unpacked": done}, [f"{arguments.folder}: {done} events have files of their own again"])
+    count = _open_folder(arguments).store.unpack(progress_bar("unpacking"))
+    print_answer(arguments, {"unpacked": count}, [f"{arguments.folder}: {count} events have files of their own again"])
 
 
-def _set(arguments: argparse.Namespace) -> "SetFolder":
+def _open_folder(arguments: argparse.Namespace) -> "SetFolder":
+    """Return the folder of the set; raise `InputError` if it holds no event set."""
     from ...events.folders import SetFolder
 
     folder = SetFolder(arguments.folder)
-    _ = folder.recipe  # refuses what is no event set
+    _ = folder.recipe  # raises InputError for a folder without an event set
     return folder

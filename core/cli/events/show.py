@@ -1,4 +1,4 @@
-"""``mphdrr events show SET -o sheet.png``."""
+"""Action ``mphdrr events show SET -o sheet.png``: a contact sheet, or a list, of events."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ from ...figures.page import SUFFIXES
 from ..options import output_path, print_answer
 from .action import add_action
 
-_ON_SHEET = 4
-"""Events on a sheet by default."""
+_EVENTS_PER_SHEET = 4
+"""Default number of events on a sheet."""
 _COLUMNS = ("x_mm", "y_mm", "z_mm", "phi_degrees", "theta_degrees", "psi_degrees")
 
 
 def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
-    """Add the action."""
+    """Add the action ``events show``."""
     parser = add_action(actions, "show", _run)
     add = parser.add_argument
-    text = f"numbers of the events; default: the first {_ON_SHEET} for a sheet, all for a list"
+    text = f"numbers of the events; default: the first {_EVENTS_PER_SHEET} for a sheet, all for a list"
     add("--events", type=int, nargs="+", metavar="I", help=text)
-    add("--model", metavar="NAME", help="whose images are drawn; default: the recipe's first")
+    add("--model", metavar="NAME", help="model whose images are drawn; default: the recipe's first")
     add("-o", "--output", metavar="FILE", help=f"the sheet: {', '.join(SUFFIXES)}; default: a list as text")
 
 
@@ -39,42 +39,42 @@ def _run(arguments: argparse.Namespace) -> None:
     path = None if arguments.output is None else output_path(arguments.output, SUFFIXES)
     if path is None and arguments.model is not None:
         raise InputError("--model says what is drawn: give -o FILE, too")
-    whole = events.EventSet(arguments.folder)
-    if not whole:
+    event_set = events.EventSet(arguments.folder)
+    if not event_set:
         raise InputError(f"{arguments.folder}: it holds no events yet; mphdrr events make makes them")
-    chosen = _chosen(whole, arguments.events, None if path is None else _ON_SHEET)
+    chosen = _choose_events(event_set, arguments.events, None if path is None else _EVENTS_PER_SHEET)
     rows = [event.row for event in chosen]
     if path is None:
         print_answer(arguments, rows, _table(rows))
         return
     name = Path(arguments.folder).absolute().name
-    contact_sheet(list(chosen), arguments.model, name, _summary(whole)).write(path)
-    print_answer(arguments, rows, [f"{path}: events {', '.join(map(str, chosen.numbers))} of {len(whole)}"])
+    contact_sheet(list(chosen), arguments.model, name, _summary(event_set)).write(path)
+    print_answer(arguments, rows, [f"{path}: events {', '.join(map(str, chosen.numbers))} of {len(event_set)}"])
 
 
-def _chosen(whole: events.EventSet, numbers: list[int] | None, most: int | None) -> events.EventSet:
-    """The events with these numbers; without any, the first ones."""
+def _choose_events(event_set: events.EventSet, numbers: list[int] | None, max_count: int | None) -> events.EventSet:
+    """Return the events with these numbers, or without numbers the first `max_count` events, all if that is None."""
     if numbers is None:
-        return whole[:most]
-    there = whole.numbers
+        return event_set[:max_count]
+    stored = event_set.numbers
     for number in numbers:
-        if number not in there:
-            raise InputError(f"--events {number}: no such event; there are {len(there)}, {there[0]} to {there[-1]}")
-    return whole.where(lambda row: row["event"] in numbers)
+        if number not in stored:
+            raise InputError(f"--events {number}: no such event; there are {len(stored)}, {stored[0]} to {stored[-1]}")
+    return event_set.where(lambda row: row["event"] in numbers)
 
 
-def _summary(whole: events.EventSet) -> str:
-    """How many events a set has, by phantom and split."""
-    parts = [f"{len(whole)} events"]
+def _summary(event_set: events.EventSet) -> str:
+    """Return the number of events of a set, in all and by phantom and split, as text."""
+    texts = [f"{len(event_set)} events"]
     for column in ("phantom", "split"):
-        counts = Counter(row[column] for row in whole.index if row[column])
+        counts = Counter(row[column] for row in event_set.index if row[column])
         if len(counts) > 1 or column == "split":
-            parts.append(", ".join(f"{name} {count}" for name, count in counts.items()))
-    return "   ·   ".join(filter(None, parts))
+            texts.append(", ".join(f"{name} {count}" for name, count in counts.items()))
+    return "   ·   ".join(filter(None, texts))
 
 
 def _table(rows: list[dict[str, Any]]) -> list[str]:
-    """A line for each event, and one above them."""
+    """Return a line of text for each event, below a heading."""
     names = max(7, *(len(str(row["phantom"])) for row in rows))
     splits = max(5, *(len(row["split"] or "") for row in rows))
     heading = f"{'event':>6}  {'phantom':<{names}}  {'split':<{splits}}" + "".join(

@@ -1,4 +1,4 @@
-"""``mphdrr events status SET``."""
+"""Action ``mphdrr events status SET``: number of events, size and missing events of a set."""
 
 import argparse
 from dataclasses import asdict
@@ -6,36 +6,36 @@ from dataclasses import asdict
 from ... import events
 from ...errors import number_ranges
 from ...memory import readable_size
-from ..options import counted, print_answer
+from ..options import count_text, print_answer
 from .action import add_action
 
 
 def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
-    """Add the action."""
+    """Add the action ``events status``."""
     add_action(actions, "status", _run)
 
 
 def _run(arguments: argparse.Namespace) -> None:
-    """Say how many events a set has, and which are missing.
+    """Show the number of events of a set, and which are missing.
 
     mphdrr events status set
     """
-    found = events.status(arguments.folder)
-    lines = [f"{found.made} of {found.asked} events, {readable_size(found.size)}"]
-    for name, counts in (("phantoms", found.phantoms), ("splits", found.splits)):
+    status = events.status(arguments.folder)
+    lines = [f"{status.made} of {status.asked} events, {readable_size(status.size)}"]
+    for name, counts in (("phantoms", status.phantoms), ("splits", status.splits)):
         if counts:
             lines.append(f"{name}: " + ", ".join(f"{key} {count}" for key, count in counts.items()))
-    if found.shards:
-        lines.append(f"in {counted(found.shards, 'shard')}")
-    if len(found.builds) > 1:
-        builds = ", ".join(f"{build or 'of version 0.1'} {count}" for build, count in found.builds.items())
+    if status.shards:
+        lines.append(f"in {count_text(status.shards, 'shard')}")
+    if len(status.builds) > 1:
+        builds = ", ".join(f"{build or 'of version 0.1'} {count}" for build, count in status.builds.items())
         lines.append(f"builds of mphDRR: {builds}; events of two may differ in their last digits")
-    if found.missing:
-        lines.append(f"missing: {numbers_text(found.missing)}; mphdrr events make {arguments.folder} makes them")
-    print_answer(arguments, asdict(found), lines)
+    if status.missing:
+        lines.append(f"missing: {numbers_text(status.missing)}; mphdrr events make {arguments.folder} makes them")
+    print_answer(arguments, asdict(status), lines)
 
 
 def numbers_text(numbers: list[int]) -> str:
-    """Whole numbers in order, such as "0-7, 12, 30-99"."""
+    """Return ascending whole numbers as text, such as "0-7, 12, 30-99"."""
     texts = number_ranges(numbers)
     return ", ".join(texts if len(texts) <= 10 else [*texts[:10], f"… ({len(numbers)} in all)"])

@@ -1,4 +1,4 @@
-"""``mphdrr geometry calibrate RECIPE -o FILE``."""
+"""Action ``mphdrr geometry calibrate RECIPE -o FILE``: module positions and tilts from images of point sources."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ import numpy as np
 from .... import core as mph
 from ...files import write_bytes
 from ...runs.mosaic import write_png
-from ..options import add_run, counted, output_path, print_answer, progress_bar
+from ..options import add_run, count_text, output_path, print_answer, progress_bar
 
-_LISTED = 5
+_MAX_LISTED_MODULES = 5
 
 
 def add_parser(actions: Any) -> None:
-    """Add the action."""
+    """Add the action ``geometry calibrate``."""
     parser = add_run(actions, "calibrate", _run)
     parser.add_argument("recipe", metavar="RECIPE", help="recipe of the calibration (.toml)")
     text = "the calibrated workbook (.xlsx, .xlsm); covariances (.json) and residuals (.png) are written beside it"
@@ -28,47 +28,49 @@ def add_parser(actions: Any) -> None:
 
 
 def _run(arguments: argparse.Namespace) -> None:
-    """Find where the modules are from images of point sources, and write the workbook with their places and tilts.
+    """Find the positions and tilts of the modules from images of point sources, and write the workbook with them.
 
     mphdrr geometry calibrate points.toml -o calibrated.xlsx
     """
-    from ...design.calibration_recipe import run_calibration  # takes a while, as for --help
+    from ...design.calibration_recipe import run_calibration  # this import takes a while, which --help does not need
 
     path = output_path(arguments.output, (".xlsx", ".xlsm"))
-    found = run_calibration(arguments.recipe, progress_bar("finding spots"))
-    source = found.system.source
-    mph.write_system(found.system, path, None if source is None else source.path)
-    record = _record(found)
+    calibration = run_calibration(arguments.recipe, progress_bar("finding spots"))
+    source = calibration.system.source
+    mph.write_system(calibration.system, path, None if source is None else source.path)
+    record = _record(calibration)
     write_bytes(path.with_suffix(".json"), json.dumps(record, indent=1).encode())
-    write_png(found.residual_sheet().picture, path.with_suffix(".png"))
-    print_answer(arguments, record, _lines(found, path))
+    write_png(calibration.residual_sheet().picture, path.with_suffix(".png"))
+    print_answer(arguments, record, _lines(calibration, path))
 
 
-def _record(found: mph.Calibration) -> dict[str, Any]:
-    """The calibration as JSON has it: no NaN, angles in rad."""
-    names = ("points", "covariance", "chi_square", "misfit", "used", "spread", "told", "detector_offset")
-    record = {name: _plain(getattr(found, name).tolist()) for name in names}
-    record |= {name: list(getattr(found, name)) for name in ("names", "misfitting", "gauge")}
-    of_modules = ("numbers", "centers", "tilt", "collimator_length")
-    geometry = {name: getattr(found.system, name).tolist() for name in of_modules}
-    return {**geometry, **record, "untold": found.untold(), "units": "mm, rad"}
+def _record(calibration: mph.Calibration) -> dict[str, Any]:
+    """Return the calibration as JSON: angles in rad, None for NaN."""
+    array_names = ("points", "covariance", "chi_square", "misfit", "used", "spread", "told", "detector_offset")
+    record = {name: _json_value(getattr(calibration, name).tolist()) for name in array_names}
+    record |= {name: list(getattr(calibration, name)) for name in ("names", "misfitting", "gauge")}
+    module_names = ("numbers", "centers", "tilt", "collimator_length")
+    geometry = {name: getattr(calibration.system, name).tolist() for name in module_names}
+    return {**geometry, **record, "untold": calibration.untold(), "units": "mm, rad"}
 
 
-def _plain(value: Any) -> Any:
-    return [_plain(each) for each in value] if isinstance(value, list) else None if value != value else value
+def _json_value(value: Any) -> Any:
+    """Return a number or nested lists of numbers with None for NaN, which JSON lacks."""
+    return [_json_value(item) for item in value] if isinstance(value, list) else None if value != value else value
 
 
-def _lines(found: mph.Calibration, path: Path) -> Iterator[str]:
-    unit = np.where([name.startswith("tilt") for name in found.names], np.degrees(1.0), 1.0)
-    spread = np.sqrt((found.spread**2).mean(axis=0)) * unit
-    images = f"{found.used.sum()} of {found.used.size} images"
-    yield f"{path}: {counted(len(found.system), 'module')} by {counted(len(found.points), 'point')}, {images}"
-    for name, sd in zip(found.names, spread, strict=True):
+def _lines(fit: mph.Calibration, path: Path) -> Iterator[str]:
+    """Yield the lines of the calibration's summary, with the modules that fit worst."""
+    unit = np.where([name.startswith("tilt") for name in fit.names], np.degrees(1.0), 1.0)
+    deviations = np.sqrt((fit.spread**2).mean(axis=0)) * unit
+    images = f"{fit.used.sum()} of {fit.used.size} images"
+    yield f"{path}: {count_text(len(fit.system), 'module')} by {count_text(len(fit.points), 'point')}, {images}"
+    for name, sd in zip(fit.names, deviations, strict=True):
         yield f"  {name:12s} known to {sd:.3f} {'degrees' if name.startswith('tilt') else 'mm'}"
-    for line in found.summary():
+    for line in fit.summary():
         yield f"  {line}"
-    if np.isfinite(found.chi_square).any():
-        yield f"  chi-square {np.nanmin(found.chi_square):.2f} to {np.nanmax(found.chi_square):.2f} per degree of freedom"
+    if np.isfinite(fit.chi_square).any():
+        yield f"  chi-square {np.nanmin(fit.chi_square):.2f} to {np.nanmax(fit.chi_square):.2f} per degree of freedom"
     yield " module  chi-square  misfit  images"
-    for m in np.argsort(-np.nan_to_num(found.misfit))[:_LISTED]:
-        yield f"{found.system.numbers[m]:7d} {found.chi_square[m]:11.2f} {found.misfit[m]:7.2f} {found.used[:, m].sum():7d}"
+    for m in np.argsort(-np.nan_to_num(fit.misfit))[:_MAX_LISTED_MODULES]:
+        yield f"{fit.system.numbers[m]:7d} {fit.chi_square[m]:11.2f} {fit.misfit[m]:7.2f} {fit.used[:, m].sum():7d}"

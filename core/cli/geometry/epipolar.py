@@ -1,4 +1,4 @@
-"""``mphdrr geometry epipolar FILE --pixel MODULE:COLUMN,ROW``."""
+"""Action ``mphdrr geometry epipolar FILE --pixel MODULE:COLUMN,ROW``: a pixel's ray in all views, or a point from pixels."""
 
 import argparse
 import math
@@ -11,35 +11,35 @@ from ...arrays import Array, table_rows
 from ...errors import expecting
 from ...geometry.scanner import Scanner
 from ..options import print_answer
-from ..scanners import chosen_modules, read_any
-from .arguments import add_action, add_views, views_of
+from ..scanners import chosen_modules, read_any_scanner
+from .arguments import add_action, add_views, chosen_views
 
-# A module is named as one that does not fit if the chance of its misfit is below this, counted for all modules.
-_CHANCE = 0.01
+_SIGNIFICANCE = 0.01
+"""Probability of the worst misfit by chance, over all modules, below which the module is said not to fit."""
 
 
 def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
-    """Add the action."""
+    """Add the action ``geometry epipolar``."""
     parser = add_action(actions, "epipolar", _run)
     add = parser.add_argument
-    pixel = "module number, column and row of its image, counted from 0; several: of one point, whose place is sought"
+    pixel = "module number, column and row of its image, from 0; several: pixels of one point, whose position is sought"
     add("--pixel", action="append", required=True, metavar="MODULE:COLUMN,ROW", help=pixel)
-    depth = "of one pixel: where its ray begins and ends, or a single depth, mm from the pinhole; default: at the ROI"
+    depth = "for one pixel: depths of its ray's ends, or a single depth, mm from the pinhole; default: across the ROI"
     add("--depth", type=float, nargs="+", metavar="MM", help=depth)
-    add("--sigma", type=float, metavar="PX", help="of several: standard deviation of columns and rows (default: 1)")
-    add("--modules", metavar="RANGE", help="those to list, such as 1-40 or 1-20,41; default: all")
+    add("--sigma", type=float, metavar="PX", help="for several: standard deviation of columns and rows (default: 1)")
+    add("--modules", metavar="RANGE", help="modules to list, such as 1-40 or 1-20,41; default: all")
     add_views(parser, "pixels of the images")
 
 
 def _run(arguments: argparse.Namespace) -> None:
-    """Say where all modules see what a pixel of one sees; or where a point is, by its pixels in several.
+    """Show where all modules see the ray of one module's pixel; or find a point from its pixels in several modules.
 
     mphdrr geometry epipolar scanner.xlsx --pixel 7:120,130
     mphdrr geometry epipolar scanner.xlsx --pixel 7:120,130 --pixel 31:99.4,140.2 --pixel 52:131,88 --sigma 0.5
     """
-    system = read_any(arguments)
-    pixels = [_pixel(system, text) for text in arguments.pixel]
-    views = views_of(system, arguments)
+    system = read_any_scanner(arguments)
+    pixels = [_parse_pixel(system, text) for text in arguments.pixel]
+    views = chosen_views(system, arguments)
     if len(pixels) == 1:
         if arguments.sigma is not None:
             raise mph.InputError("--sigma: expected several --pixel, whose point is sought")
@@ -52,34 +52,36 @@ def _run(arguments: argparse.Namespace) -> None:
 
 
 def _print_ray(arguments: argparse.Namespace, system: Scanner, views: mph.Views, m: int, pixel: list[float]) -> None:
-    near, far = _depths(arguments.depth, system, m)
+    """Print the image, in every view, of the ray of one pixel (column, row) of module index `m`, and the epipoles."""
+    near, far = _depth_range(arguments.depth, system, m)
     segments = mph.epipolar_segments(views, m, pixel, near, far)
     ends = mph.points_at_depths(views, m, pixel, np.array([near, far]))
     n_v, n_u = views.shape
     rows: list[dict[str, Any]] = []
-    listed = np.isin(system.numbers, chosen_modules(system, arguments.modules).numbers)
-    for n in map(int, np.flatnonzero(listed)):
-        rows.append({"number": int(system.numbers[n]), "from": _listed(segments[n, 0]), "to": _listed(segments[n, 1])})
+    is_listed = np.isin(system.numbers, chosen_modules(system, arguments.modules).numbers)
+    for n in map(int, np.flatnonzero(is_listed)):
+        near_end, far_end = map(_to_list, segments[n])
+        rows.append({"number": int(system.numbers[n]), "from": near_end, "to": far_end})
         if n == m:
             rows[-1] |= {"line": None, "epipole": None}
             continue
-        at = mph.epipole(views, m, n)
-        place = at[:2] / at[2] if at[2] > 0 else np.full(2, np.nan)
-        inside = (place >= -0.5).all() and (place <= [n_u - 0.5, n_v - 0.5]).all()
-        line = _listed(mph.epipolar_lines(views, m, n, pixel))
-        rows[-1] |= {"line": line, "epipole": _listed(place) if inside else None}
-    number = int(system.numbers[m])
-    record = {"module": number, "pixel": pixel, "depths": [near, far], "points": ends.tolist(), "modules": rows}
-    text = f"module {number}, pixel ({pixel[0]:g}, {pixel[1]:g})"
+        epipole = mph.epipole(views, m, n)
+        epipole_pixel = epipole[:2] / epipole[2] if epipole[2] > 0 else np.full(2, np.nan)
+        is_inside = (epipole_pixel >= -0.5).all() and (epipole_pixel <= [n_u - 0.5, n_v - 0.5]).all()
+        line = _to_list(mph.epipolar_lines(views, m, n, pixel))
+        rows[-1] |= {"line": line, "epipole": _to_list(epipole_pixel) if is_inside else None}
+    module_number = int(system.numbers[m])
+    record = {"module": module_number, "pixel": pixel, "depths": [near, far], "points": ends.tolist(), "modules": rows}
+    text = f"module {module_number}, pixel ({pixel[0]:g}, {pixel[1]:g})"
     start, end = (" ".join(f"{x:.2f}" for x in point) for point in ends)
     if near == far:
         lines = [f"{text} at a depth of {near:.2f} mm: ({start}) mm", " module     column, row      epipole"]
     else:
         lines = [f"{text} from a depth of {near:.2f} to {far:.2f} mm: from ({start}) to ({end}) mm"]
         lines += [" module  from column, row    to column, row       epipole"]
-    shown = ("from", "epipole") if near == far else ("from", "to", "epipole")
+    shown_names = ("from", "epipole") if near == far else ("from", "to", "epipole")
     for row in rows:
-        pixels = "".join(f"{_text(row[name]):>18}" for name in shown)
+        pixels = "".join(f"{_pixel_text(row[name]):>18}" for name in shown_names)
         lines.append(f"{row['number']:7d}{pixels.rstrip()}")
     seeing = sum(row["from"] is not None for row in rows)
     lines += [f"{seeing} of {len(rows)} modules have it in their image; the epipole is where a module has the pinhole"]
@@ -89,43 +91,45 @@ def _print_ray(arguments: argparse.Namespace, system: Scanner, views: mph.Views,
 def _print_point(
     arguments: argparse.Namespace, system: Scanner, views: mph.Views, pixels: list[tuple[int, list[float]]]
 ) -> None:
-    index = np.array([m for m, _ in pixels])
-    numbers = system.numbers[index].tolist()
-    twice = [number for number in numbers if numbers.count(number) > 1]
-    if twice:
-        raise mph.InputError(f"--pixel: expected one pixel of each module, got several of module {twice[0]}")
+    """Print the point that fits the pixels best, its uncertainty and the residuals; `pixels` has (module index, pixel)."""
+    module_indices = np.array([m for m, _ in pixels])
+    numbers = system.numbers[module_indices].tolist()
+    repeated = [number for number in numbers if numbers.count(number) > 1]
+    if repeated:
+        raise mph.InputError(f"--pixel: expected one pixel of each module, got several of module {repeated[0]}")
     sigma = 1.0 if arguments.sigma is None else arguments.sigma
-    fit = mph.fit_marker(views, index, [pixel for _, pixel in pixels], sigma)
-    odd = fit.worst if fit.worst is not None and fit.misfit_p_values[fit.worst] < _CHANCE / len(numbers) else None
-    columns = {"number": system.numbers[index], "column": fit.residuals[:, 0], "row": fit.residuals[:, 1]}
+    fit = mph.fit_marker(views, module_indices, [pixel for _, pixel in pixels], sigma)
+    worst, level = fit.worst, _SIGNIFICANCE / len(numbers)
+    worst = worst if worst is not None and fit.misfit_p_values[worst] < level else None
+    columns = {"number": system.numbers[module_indices], "column": fit.residuals[:, 0], "row": fit.residuals[:, 1]}
     rows = table_rows({**columns, "misfit": fit.misfits, "p_value": fit.misfit_p_values})
     modules = [{name: None if x != x else x for name, x in row.items()} for row in rows]  # no NaN in JSON
     names = ("point", "standard_deviations", "covariance", "chi2", "degrees", "p_value")
     record = {name: np.asarray(getattr(fit, name)).tolist() for name in names} | {"sigma": sigma, "modules": modules}
-    record |= {"misfitting": None if odd is None else numbers[odd], "units": "mm, mm^2, pixels"}
+    record |= {"misfitting": None if worst is None else numbers[worst], "units": "mm, mm^2, pixels"}
     axes = zip("xyz", fit.point, fit.standard_deviations, strict=True)
     lines = ["point " + "   ".join(f"{axis} {x:.3f} +- {sd:.3f}" for axis, x, sd in axes) + " mm"]
     lines += [" module  residual column       row    misfit     chance"]
     for row in rows:
-        known = row["misfit"] == row["misfit"]
-        misfit = " {misfit:9.2f} {p_value:10.2g}" if known else "         -          -"
+        has_misfit = row["misfit"] == row["misfit"]
+        misfit = " {misfit:9.2f} {p_value:10.2g}" if has_misfit else "         -          -"
         lines.append(f"{{number:7d}} {{column:16.3f}} {{row:9.3f}}{misfit}".format(**row))
-    chance = f"a chance of {fit.p_value:.2g} if sigma is {sigma:g} px"
-    lines += [f"chi2 {fit.chi2:.2f} of {fit.degrees} degrees of freedom, {chance}"]
-    if odd is not None:
-        lines += [f"module {numbers[odd]} does not fit: without it chi2 falls by {fit.misfits[odd]:.2f}"]
-    elif fit.p_value < _CHANCE:
+    chance_text = f"a chance of {fit.p_value:.2g} if sigma is {sigma:g} px"
+    lines += [f"chi2 {fit.chi2:.2f} of {fit.degrees} degrees of freedom, {chance_text}"]
+    if worst is not None:
+        lines += [f"module {numbers[worst]} does not fit: without it chi2 falls by {fit.misfits[worst]:.2f}"]
+    elif fit.p_value < _SIGNIFICANCE:
         lines += ["they do not fit together, and nothing says which is wrong"]
     else:
         lines += ["they fit together"]
     print_answer(arguments, record, lines)
 
 
-def _pixel(system: Scanner, text: str) -> tuple[int, list[float]]:
-    """Index of the module, and its column and row, of a ``MODULE:COLUMN,ROW``."""
-    module, _, place = text.partition(":")
+def _parse_pixel(system: Scanner, text: str) -> tuple[int, list[float]]:
+    """Return the module's index, and its column and row, from a text ``MODULE:COLUMN,ROW``."""
+    module, _, position_text = text.partition(":")
     with expecting(f"--pixel {text!r}: expected MODULE:COLUMN,ROW, such as 7:120,130.5"):
-        number, (column, row) = int(module), map(float, place.split(","))
+        number, (column, row) = int(module), map(float, position_text.split(","))
         if not (math.isfinite(column) and math.isfinite(row)):
             raise ValueError
     index = np.flatnonzero(system.numbers == number)
@@ -135,24 +139,26 @@ def _pixel(system: Scanner, text: str) -> tuple[int, list[float]]:
     return int(index[0]), [column, row]
 
 
-def _depths(given: list[float] | None, system: Scanner, m: int) -> tuple[float, float]:
-    if given is None:
+def _depth_range(depths: list[float] | None, system: Scanner, m: int) -> tuple[float, float]:
+    """Return the depths, mm from the pinhole, between which a ray is shown: as typed, else across the ROI of module `m`."""
+    if depths is None:
         distance = float(np.linalg.norm(system.poses()[m, :3, 3]))
         radius = float(system.roi_radius[m]) if isinstance(system, mph.PinholeSystem) else system.region_radius()
         return max(distance - radius, 0.0), distance + radius
-    if len(given) > 2:
-        raise mph.InputError(f"--depth: expected one depth or two, got {len(given)}")
-    near, far = given[0], given[-1]
+    if len(depths) > 2:
+        raise mph.InputError(f"--depth: expected one depth or two, got {len(depths)}")
+    near, far = depths[0], depths[-1]
     if not 0 <= near <= far < math.inf:
-        got = " ".join(f"{depth:g}" for depth in given)
+        got = " ".join(f"{depth:g}" for depth in depths)
         raise mph.InputError(f"--depth: expected one depth of 0 mm or more, or two in ascending order, got {got}")
     return near, far
 
 
-def _listed(values: Array) -> list[float] | None:
-    """Numbers for JSON, which has no NaN."""
+def _to_list(values: Array) -> list[float] | None:
+    """Return numbers as a list for JSON; None if one is NaN, which JSON lacks."""
     return None if np.isnan(values).any() else values.tolist()
 
 
-def _text(pixel: list[float] | None) -> str:
+def _pixel_text(pixel: list[float] | None) -> str:
+    """Return a pixel as "column, row", or "-" for none."""
     return "-" if pixel is None else f"{pixel[0]:.2f}, {pixel[1]:.2f}"

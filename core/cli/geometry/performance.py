@@ -1,4 +1,4 @@
-"""``mphdrr geometry performance FILE``."""
+"""Action ``mphdrr geometry performance FILE``: sensitivity, resolution and field of view of each module."""
 
 import argparse
 import math
@@ -8,15 +8,15 @@ import numpy as np
 from .... import core as mph
 from ...arrays import table_rows
 from ..options import print_answer
-from ..scanners import read_workbook
-from .arguments import add_action, add_materials, optics_of
+from ..scanners import read_pinhole_system
+from .arguments import add_action, add_materials, chosen_optics
 
 
 def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
-    """Add the action."""
+    """Add the action ``geometry performance``."""
     parser = add_action(actions, "performance", _run)
     add = parser.add_argument
-    add("--point", type=float, nargs=3, default=[0, 0, 0], metavar="MM", help="where the source is, x y z")
+    add("--point", type=float, nargs=3, default=[0, 0, 0], metavar="MM", help="position of the source, x y z")
     add_materials(parser)
 
 
@@ -25,8 +25,8 @@ def _run(arguments: argparse.Namespace) -> None:
 
     mphdrr geometry performance scanner.xlsx --isotope Tc-99m --aperture-mu tungsten --crystal-mu NaI
     """
-    system = read_workbook(arguments)
-    points, optics = [arguments.point], optics_of(arguments, system)
+    system = read_pinhole_system(arguments)
+    points, optics = [arguments.point], chosen_optics(arguments, system)
     counts = 1e6 * mph.sensitivity(system, points, optics=optics)[0]
     fwhm = mph.resolution(system, points, optics=optics)[0]
     radius = system.roi_radius_seen()
@@ -39,12 +39,12 @@ def _run(arguments: argparse.Namespace) -> None:
         "roi_radius_seen": radius,
         "roi_radius": system.roi_radius,
     }
-    seeing = counts > 0
-    rms = math.sqrt(np.average(fwhm[seeing] ** 2, weights=counts[seeing])) if seeing.any() else None
+    is_seeing = counts > 0
+    rms = math.sqrt(np.average(fwhm[is_seeing] ** 2, weights=counts[is_seeing])) if is_seeing.any() else None
     total = {
         "sensitivity": float(counts.sum()),
         "resolution": rms,
-        "modules_seeing": int(seeing.sum()),
+        "modules_seeing": int(is_seeing.sum()),
         # Up to the rounding of l in the workbook.
         "modules_holding_roi": int(np.count_nonzero(radius >= system.roi_radius - 1e-3)),
         "sampling_gap_degrees": math.degrees(mph.sampling_gaps(system, points)[0]),

@@ -1,7 +1,11 @@
-"""Exports of event sets for other programs.
+"""Exports of event sets as files that other programs read: pytorch-3dunet, WebDataset, NumPy, the users' own layout.
 
-To add a program, write its `Layout` in a module here, and list it in `events/programs.py`; `mphdrr events export` takes it
-from there.
+`export_events` writes a set for a program of `PROGRAMS`; `plan_export` first tells how much there is to write. A program is
+an `ExportLayout` (`layout.py`): the files of an event and their contents, with the program's options.
+
+To add a program, write a subclass of `ExportLayout` in a module here with the class's name in lower case, and add a line to
+the table in `events/programs.py`, from which `mphdrr events export` takes it. Add new options to that command in
+`core/cli/events/export.py`.
 """
 
 from collections.abc import Sequence
@@ -15,13 +19,13 @@ from ..event_set import EventSet
 from ..fields import field_shapes
 from ..noise_choice import NoiseChoice, checked_noise, require_counted
 from ..programs import PROGRAMS, Program
-from .layout import Chosen
-from .writing import Plan, plan_export
+from .layout import ExportSelection
+from .writing import ExportPlan, make_plan
 
-__all__ = ["PROGRAMS", "Plan", "Program", "export_events", "planned_export"]
+__all__ = ["PROGRAMS", "ExportPlan", "Program", "export_events", "plan_export"]
 
 
-def planned_export(
+def plan_export(
     events: EventSet,
     folder: AnyPath,
     program: str,
@@ -30,29 +34,29 @@ def planned_export(
     noise: NoiseChoice = None,
     level: float = 1.0,
     **options: Any,
-) -> Plan:
-    """What `export_events` would write, and how much of it is there already: `Plan.says`, and `Plan.write` to do it."""
+) -> ExportPlan:
+    """Return the plan of an export with the arguments of `export_events`: `summary` describes it, `write` writes it."""
     instance(events, EventSet, "export")
     one_of(program, PROGRAMS, "program")
     chosen_program = PROGRAMS[program]
     options = {name: value for name, value in options.items() if value is not None}
     for name in sorted(options.keys() - set(chosen_program.options)):
-        had = ", ".join(chosen_program.options) or "none"
-        raise InputError(f"{program}: no option {name!r}, it has {had}")
-    _ = field_shapes(events)  # of all joined sets
-    known = tuple(events.recipe.models)
-    names = known if models is None else (models,) if isinstance(models, str) else tuple(models)
+        available = ", ".join(chosen_program.options) or "none"
+        raise InputError(f"{program}: no option {name!r}, it has {available}")
+    _ = field_shapes(events)  # raises InputError where joined sets do not match
+    all_models = tuple(events.recipe.models)
+    names = all_models if models is None else (models,) if isinstance(models, str) else tuple(models)
     for name in names:
-        one_of(name, known, "model")
+        one_of(name, all_models, "model")
     noise = checked_noise(noise)
     level = positive(level, "level")
     if level != 1 and noise is None:
-        raise InputError("level: it is of the noise; choose noise as well, or leave it out")
+        raise InputError("level: needs noise; choose noise as well, or leave it out")
     if noise is not None:
         require_counted(events, names)
-    chosen = Chosen(events, tuple(dict.fromkeys(names)), noise, level)
-    layout = chosen_program.layout(chosen, **options)
-    return plan_export(layout, chosen, folder_path(folder), program, {**options, **layout.contained()})
+    selection = ExportSelection(events, tuple(dict.fromkeys(names)), noise, level)
+    layout = chosen_program.layout(selection, **options)
+    return make_plan(layout, folder_path(folder), program, {**options, **layout.option_contents()})
 
 
 def export_events(
@@ -66,33 +70,33 @@ def export_events(
     progress: Progress | None = None,
     **options: Any,
 ) -> None:
-    """Write a set, or a part of one, for another program.
+    """Write the events of a set for another program.
 
     Parameters
     ----------
     events : EventSet
-        For instance ``set.split("train")``.
+        Events to export, for instance ``set.split("train")``.
     folder
-        A new or empty one, or one that holds the beginning of the same export, which is gone on with. Besides the
-        program's files it has ``events.csv``: which event each number of the files' names is.
+        A new or empty folder, or one with the beginning of the same export, which is then continued. Besides the program's
+        files it gets a table ``events.csv`` with the event of each number in the file names.
     program
         A name of `PROGRAMS`.
     models
-        Whose images are written, a name or several; default: all. "legacy" and "3dunet" take one.
+        Name of the model whose images are written, or several names; default: all. "legacy" and "3dunet" take one.
     noise
-        None: the mean images. "own": with the noise of each event's own seed. A whole number: another noise of that seed.
+        None: expected means. "own": noise of each event's own seed. A whole number: noise of that seed instead.
     level
-        Share of the acquisition time, with noise.
+        Fraction of the acquisition time, with noise.
     progress
-        Called as ``progress(done, total)`` after each event; what it raises stops the work, which can be gone on with.
+        Called as ``progress(done, total)`` after each event; an exception of it stops the export, which can be continued.
     options
-        The program's own: ``PROGRAMS[program].options``.
+        Options of the program, listed in ``PROGRAMS[program].options``.
 
     Raises
     ------
     InputError
-        For an unknown program, model or option, a set that the program cannot hold, and a folder that holds something else
-        or cannot be written.
+        The program, a model or an option is unknown, the program cannot represent the set, or the folder holds something
+        else or cannot be written.
     """
-    plan = planned_export(events, folder, program, models=models, noise=noise, level=level, **options)
+    plan = plan_export(events, folder, program, models=models, noise=noise, level=level, **options)
     plan.write(progress)

@@ -1,4 +1,4 @@
-"""Arrays of an event as the bytes of files; the same arrays are the same bytes."""
+"""Conversion of arrays to the bytes of files; equal arrays give equal bytes."""
 
 import io
 from collections.abc import Mapping
@@ -10,15 +10,15 @@ from ...arrays import Array
 from ...errors import needing
 
 
-def npy(array: Array) -> bytes:
-    """An array as an .npy file."""
+def npy_bytes(array: Array) -> bytes:
+    """Return the bytes of an .npy file of an array."""
     buffer = io.BytesIO()
     np.save(buffer, array, allow_pickle=False)
     return buffer.getvalue()
 
 
-def pt(array: Array) -> bytes:
-    """An array as a .pt file: one tensor, which ``torch.load(path, weights_only=True)`` gives."""
+def pt_bytes(array: Array) -> bytes:
+    """Return the bytes of a .pt file of an array: one tensor, which ``torch.load(path, weights_only=True)`` reads."""
     with needing(feature="files of tensors (.pt)"):
         import torch
     buffer = io.BytesIO()  # torch writes a file's own name into it, and that of a temporary one is random
@@ -26,8 +26,8 @@ def pt(array: Array) -> bytes:
     return buffer.getvalue()
 
 
-def hdf5(arrays: Mapping[str, Array], attributes: Mapping[str, Any]) -> bytes:
-    """Arrays as an HDF5 file, compressed, a chunk for each of their last two axes' pictures."""
+def hdf5_bytes(arrays: Mapping[str, Array], attributes: Mapping[str, Any]) -> bytes:
+    """Return the bytes of an HDF5 file of arrays by name, compressed, each image (the last two axes) a chunk."""
     import h5py
 
     buffer = io.BytesIO()

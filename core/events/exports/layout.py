@@ -1,4 +1,4 @@
-"""What an export is made of: what was chosen of a set, and the files that a program wants."""
+"""Layouts of exports: the selected arrays of an event set, and the files that a program reads."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -14,32 +14,33 @@ from ..fields import Shapes, field_shapes, float32_bytes
 from ..noise_choice import NoiseChoice, chosen_seed, noisy_images
 
 Row = dict[str, Any]
-"""A row of events.csv: i, the export's running number from 0; the event's number, split and name, what places its phantom
-besides the pose; the noise's seed, or ""."""
+"""Row of events.csv by column: "i", the running number from 0; the event's number "event", its "split", phantom "name",
+"mirror" and "size"; and "noise_seed", or ""."""
 
 
 @dataclass(frozen=True)
-class Chosen:
-    """What of a set is exported."""
+class ExportSelection:
+    """Selection of events, models and noise of a set for an export."""
 
     events: EventSet
+    """The exported events."""
     models: tuple[str, ...]
-    """The models whose images are exported."""
+    """The names of the models whose images are exported."""
     noise: NoiseChoice = None
-    """None: the mean images; "own": with the noise of each event's own seed; a number: another noise of that seed."""
+    """Noise of the images: None for expected means, "own" for each event's own seed, or a seed of other noise."""
     level: float = 1.0
-    """Share of the acquisition time, with noise."""
+    """Fraction of the acquisition time; 1 without noise."""
 
-    def seed(self, event: Event) -> int | None:
-        """The seed of the event's noise; None: there is none."""
+    def noise_seed(self, event: Event) -> int | None:
+        """Return the seed of an event's noise; None for no noise."""
         return chosen_seed(event.noise_seed, self.noise)
 
     def images(self, event: Event, model: str) -> Floats32:
-        """A model's images (M, n_v, n_u): with the noise, where they are counts."""
-        return noisy_images(event, model, self.seed(event), self.level)
+        """Return a model's images (M, n_v, n_u) of an event, with the selected noise where they are counts."""
+        return noisy_images(event, model, self.noise_seed(event), self.level)
 
     def arrays(self, event: Event) -> Iterator[tuple[str, Floats32]]:
-        """The event's arrays by their names in `shapes`: truth, images of the models, Radon images."""
+        """Yield the name, as in `shapes`, and the values of each array of an event: truth, images, Radon images."""
         yield "truth", event.truth_part()
         for model in self.models:
             yield model, self.images(event, model)
@@ -48,75 +49,96 @@ class Chosen:
 
     @cached_property
     def shapes(self) -> Shapes:
-        """The shapes of an event's arrays."""
+        """The shapes of an event's arrays, by name."""
         return field_shapes(self.events)
+
+    def record(self, event: Event) -> dict[str, Any]:
+        """Return the event's number, split, phantom, settings, poses, truth's affine, units and noise, for JSON."""
+        return {
+            "number": event.number,
+            "split": event.split or "",
+            "name": event.name,
+            "settings": event.settings,
+            "position_mm": event.position.tolist(),
+            "euler_degrees": event.euler_degrees.tolist(),
+            "pose": event.pose.tolist(),
+            "placement": event.placement.tolist(),
+            "truth_affine": event.recipe.grid.affine.tolist(),
+            "truth_quantity": event.recipe.quantity,
+            "units": {model: event.unit(model) for model in self.models},
+            "noise_seed": self.noise_seed(event),
+            "level": self.level,
+        }
 
     @property
     def radon_counts(self) -> tuple[int, ...]:
-        """Numbers of angles of the Radon images that there are."""
+        """The numbers of angles of the set's Radon images."""
         radon = self.events.recipe.radon
         return radon.counts if radon else ()
 
 
 @dataclass(frozen=True)
-class Part:
-    """What is written at once: files, of these events of the export."""
+class ExportPart:
+    """Part of an export that is written at once: some files with the events that they hold."""
 
     files: tuple[str, ...]
-    """Paths in the export's folder, with "/"."""
+    """Paths of the files relative to the export's folder, with "/"."""
     events: tuple[int, ...]
-    """Their running numbers."""
+    """Running numbers of the events in these files."""
 
 
-class Layout:
-    """The files of a program. Subclasses are made of `Chosen` and the program's own options, and say what to write."""
+class ExportLayout:
+    """Layout of the files of a program, of an `ExportSelection` and the program's options; a base class.
 
-    packed = False
-    """Whether files are compressed."""
+    A subclass implements `files` and `contents`, and takes options as keyword-only arguments.
+    """
 
-    def __init__(self, chosen: Chosen) -> None:
-        self.chosen = chosen
+    compressed = False
+    """Whether the files are compressed."""
+
+    def __init__(self, selection: ExportSelection) -> None:
+        self.selection = selection
 
     @property
     def event_bytes(self) -> int:
-        """Bytes of the files of an event, headers left out; of packed ones the most that they can be."""
-        return float32_bytes(self.chosen.shapes[name] for name in self.fields)
+        """The bytes of an event's files without headers; an upper limit for compressed files."""
+        return float32_bytes(self.selection.shapes[name] for name in self.array_names)
 
     @property
-    def fields(self) -> tuple[str, ...]:
-        """The arrays of an event that are written, by their names in `Chosen.shapes`; here all."""
-        return ("truth", *self.chosen.models, *(f"radon{n}" for n in self.chosen.radon_counts))
+    def array_names(self) -> tuple[str, ...]:
+        """The names, as in `ExportSelection.shapes`, of the arrays that are written; by default all."""
+        return ("truth", *self.selection.models, *(f"radon{n}" for n in self.selection.radon_counts))
 
-    def contained(self) -> dict[str, Any]:
-        """The contents of the files that options name, which are compared to tell whether two exports are the same."""
+    def option_contents(self) -> dict[str, Any]:
+        """Return the content of the files that options name, by option, to recognise an export with the same options."""
         return {}
 
     def files(self, row: Row) -> tuple[str, ...]:
-        """Paths of an event's files."""
+        """Return the paths of an event's files, relative to the export's folder."""
         raise NotImplementedError
 
     def contents(self, row: Row, event: Event) -> Iterator[tuple[str, bytes | memoryview]]:
-        """Each of an event's files, and what is in it."""
+        """Yield the path and the content of each of an event's files."""
         raise NotImplementedError
 
     def tables(self, rows: list[Row]) -> dict[str, bytes]:
-        """Files of the whole export."""
+        """Return the contents of files that describe the whole export, by path; by default none."""
         return {}
 
-    def parts(self, rows: list[Row]) -> list[Part]:
-        """What is written, one after the other; here, the files of an event."""
-        return [Part(self.files(row), (row["i"],)) for row in rows]
+    def parts(self, rows: list[Row]) -> list[ExportPart]:
+        """Return the parts in the order of writing; by default one for each event."""
+        return [ExportPart(self.files(row), (row["i"],)) for row in rows]
 
-    def write(self, part: Part, rows: list[Row], folder: Path, written: Callable[[], None]) -> None:
-        """Write a part; call `written` after each event."""
+    def write(self, part: ExportPart, rows: list[Row], folder: Path, report_event: Callable[[], None]) -> None:
+        """Write a part into a folder; call `report_event` after each event."""
         for i in part.events:
-            for name, content in self.contents(rows[i], self.chosen.events[i]):
+            for name, content in self.contents(rows[i], self.selection.events[i]):
                 write_bytes(folder / name, content)
-            written()
+            report_event()
 
 
-def only_model(chosen: Chosen, program: str) -> str:
-    """The model of a program that takes the images of one; `InputError` if several are chosen."""
-    if len(chosen.models) != 1:
-        raise InputError(f"{program} takes the images of one model: choose one of {', '.join(chosen.models)}")
-    return chosen.models[0]
+def single_model(selection: ExportSelection, program: str) -> str:
+    """Return the selected model for a program that takes one; `InputError` where several, or none, are selected."""
+    if len(selection.models) != 1:
+        raise InputError(f"{program} takes the images of one model: choose one of {', '.join(selection.models)}")
+    return selection.models[0]

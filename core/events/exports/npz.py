@@ -1,25 +1,24 @@
-"""One archive of numpy an event: ``000012.npz`` with the truth, the images of each model, Radon images and the pose."""
+"""NumPy archives, one per event: ``000012.npz`` with truth, images of each model, Radon images, pose and record."""
 
 import json
 from collections.abc import Iterator
 
-from ...volumes.formats.numpy_files import packed
+from ...volumes.formats.numpy_files import pack_npz
 from ..event_set import Event
-from .layout import Layout, Row
-from .record import record
+from .layout import ExportLayout, Row
 
 
-class Npz(Layout):
-    """Names: truth (x, y, z), truth_affine, those of the models (M, n_v, n_u), radon96 (96, n_v, n_u), pose, record."""
+class Npz(ExportLayout):
+    """NumPy archives with truth (x, y, z), truth_affine, MODEL (M, n_v, n_u), radon96 (96, n_v, n_u), pose and record."""
 
-    packed = True
+    compressed = True
 
     def files(self, row: Row) -> tuple[str, ...]:
-        """One."""
+        """Return the path of the event's archive."""
         return (f"{row['i']:06d}.npz",)
 
     def contents(self, row: Row, event: Event) -> Iterator[tuple[str, bytes | memoryview]]:
-        """All that there is of the event; `record` is text, as JSON."""
-        affine, text = event.recipe.grid.affine, json.dumps(record(self.chosen, event))
-        arrays = {**dict(self.chosen.arrays(event)), "truth_affine": affine, "pose": event.pose, "record": text}
-        yield self.files(row)[0], packed(arrays)
+        """Yield the archive with all arrays of the event, and its record as a text of JSON."""
+        affine, text = event.recipe.grid.affine, json.dumps(self.selection.record(event))
+        arrays = {**dict(self.selection.arrays(event)), "truth_affine": affine, "pose": event.pose, "record": text}
+        yield self.files(row)[0], pack_npz(arrays)

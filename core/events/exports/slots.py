@@ -1,9 +1,9 @@
-"""The users' own order of images: a ring in a row, and beside it mirrored images that fill the row up.
+"""Slots of images: the users' own order, a ring in a row, which mirrored images fill up.
 
-Their networks take 96 images of a scanner of 4 rings of 20 modules: slot = 24 row + column, where columns 20 to 23 hold
-"the mirrored ones". The rings are open arcs, so that nothing was measured beyond a row's last module: what continues an
-image without a step beyond its edge is its mirror image, as of a signal that is reflected at its end. So column 20 + j shows
-the image of column 19 - j, flipped left to right. Whoever means other ones gives a table (`read_slots`).
+The users' networks take 96 images of a scanner of 4 rings of 20 modules: slot = 24 row + column, where columns 20 to 23
+hold mirrored images. The rings are open arcs, so that nothing was measured beyond a row's last module: as a signal is
+reflected at its end, the mirror image continues an image beyond its edge without a step. So column 20 + j shows the image of
+column 19 - j, flipped left to right. A table (`read_slots`) describes any other order.
 """
 
 import csv
@@ -18,7 +18,7 @@ from ...files import AnyPath, read_text
 from ...geometry.scanner import Scanner
 
 MIRRORED = 4
-"""Columns of mirrored images at the end of a row."""
+"""Number of columns with mirrored images at the end of a row."""
 
 _TRUE, _FALSE = ("1", "yes", "true"), ("0", "no", "false", "")
 _ADVICE = "say which module each slot shows in a table of slots"
@@ -26,26 +26,26 @@ _ADVICE = "say which module each slot shows in a table of slots"
 
 @dataclass(frozen=True, eq=False)
 class Slots:
-    """Which module each slot shows."""
+    """Order of images: the module that each of S slots shows, and whether mirrored."""
 
     modules: Integers
-    """Index (S,) of each slot's module among the scanner's."""
+    """Index (S,) of each slot's module in the scanner."""
     mirrored: Bools
     """Whether each slot's image (S,) is flipped left to right."""
     columns: int
-    """Slots in a row."""
+    """Number of slots in a row."""
 
     def __len__(self) -> int:
         return len(self.modules)
 
-    def arranged(self, images: Floats32) -> Floats32:
-        """The modules' images (M, n_v, n_u) as the slots' (S, n_v, n_u); "left to right" is along u."""
-        taken = images[self.modules]
-        taken[self.mirrored] = taken[self.mirrored][..., ::-1]
-        return taken
+    def arrange(self, images: Floats32) -> Floats32:
+        """Return the images of the slots (S, n_v, n_u), flipped along u where mirrored, from the modules' (M, n_v, n_u)."""
+        arranged_images = images[self.modules]
+        arranged_images[self.mirrored] = arranged_images[self.mirrored][..., ::-1]
+        return arranged_images
 
     def table(self, system: Scanner) -> str:
-        """What each slot shows as CSV: slot, row, column, the module's number and ring (from 1), mirrored (1 or 0)."""
+        """Return a CSV table of the slots: slot, row, column, the module's number and ring (from 1), mirrored (1 or 0)."""
         rings = system.rings() + 1
         lines = ["slot,row,column,module,ring,mirrored"]
         for slot, (m, mirrored) in enumerate(zip(self.modules.tolist(), self.mirrored.tolist(), strict=True)):
@@ -55,16 +55,16 @@ class Slots:
 
 
 def row_slots(system: Scanner) -> Slots:
-    """A ring in a row, in the order of its modules, and after each row its last `MIRRORED` images mirrored.
+    """Return slots with a ring in a row, in the order of its modules, followed by its last `MIRRORED` images mirrored.
 
-    `InputError` where the rings are not of one size, or too small to mirror.
+    `InputError` where the rings differ in size, or have fewer than `MIRRORED` modules.
     """
     rings = system.rings()
     rows = [np.flatnonzero(rings == ring) for ring in dict.fromkeys(rings.tolist())]
     sizes = [len(row) for row in rows]
     if len(set(sizes)) > 1:
-        rings_of = f"whose rings have {', '.join(map(str, sizes))} modules"
-        raise InputError(f"the slots of a scanner {rings_of}: expected rings of one size; {_ADVICE}")
+        ring_sizes = f"whose rings have {', '.join(map(str, sizes))} modules"
+        raise InputError(f"the slots of a scanner {ring_sizes}: expected rings of one size; {_ADVICE}")
     if sizes[0] < MIRRORED:
         expected = f"{MIRRORED} or more, as many as are mirrored"
         raise InputError(f"the slots of a scanner with {sizes[0]} modules in a ring: expected {expected}; {_ADVICE}")
@@ -74,30 +74,30 @@ def row_slots(system: Scanner) -> Slots:
 
 
 def read_slots(path: AnyPath, system: Scanner) -> Slots:
-    """Slots from a table such as `Slots.table` writes: a CSV file with the columns slot, module and mirrored.
+    """Read slots from a table as `Slots.table` writes it: a CSV file with the columns slot, module and mirrored.
 
-    Slots are counted from 0, modules are named by their numbers, and a column "column" says how many are in a row; others
-    are not looked at. `InputError`, with the line, where something is missing or no module has the number.
+    Slots are counted from 0 and modules given by their numbers. The largest number in a column "column" gives the length of
+    a row; other columns are ignored. `InputError` names the line where a value is missing or no module has the number.
     """
-    lines = csv.DictReader(io.StringIO(read_text(path, "a table of slots")))
+    table = csv.DictReader(io.StringIO(read_text(path, "a table of slots")))
     for name in ("slot", "module", "mirrored"):
-        if name not in (lines.fieldnames or ()):
+        if name not in (table.fieldnames or ()):
             raise InputError(f"{path}: no column {name!r}; expected slot, module and mirrored")
-    index = {int(number): m for m, number in enumerate(system.numbers)}
+    module_index = {int(number): m for m, number in enumerate(system.numbers)}
     modules, mirrored, columns = [], [], 1
-    for slot, line in enumerate(lines):
-        place = f"{path}, line {lines.line_num}"
-        if (line["slot"] or "").strip() != str(slot):
-            raise InputError(f"{place}: slot {line['slot']}: expected {slot}, slots are counted from 0 one by one")
-        number = (line["module"] or "").strip()
-        if not number.isdigit() or int(number) not in index:
-            raise InputError(f"{place}: module {number!r}: expected the number of one of the set's modules")
-        word = (line["mirrored"] or "").strip().lower()
-        if word not in _TRUE + _FALSE:
-            raise InputError(f"{place}: mirrored {word!r}: expected 1 or 0")
-        modules.append(index[int(number)])
-        mirrored.append(word in _TRUE)
-        column = (line.get("column") or "").strip()
+    for slot, row in enumerate(table):
+        location = f"{path}, line {table.line_num}"
+        if (row["slot"] or "").strip() != str(slot):
+            raise InputError(f"{location}: slot {row['slot']}: expected {slot}, slots are counted from 0 one by one")
+        number = (row["module"] or "").strip()
+        if not number.isdigit() or int(number) not in module_index:
+            raise InputError(f"{location}: module {number!r}: expected the number of one of the set's modules")
+        mirrored_word = (row["mirrored"] or "").strip().lower()
+        if mirrored_word not in _TRUE + _FALSE:
+            raise InputError(f"{location}: mirrored {mirrored_word!r}: expected 1 or 0")
+        modules.append(module_index[int(number)])
+        mirrored.append(mirrored_word in _TRUE)
+        column = (row.get("column") or "").strip()
         columns = max(columns, int(column) + 1 if column.isdigit() else 1)
     if not modules:
         raise InputError(f"{path}: no slots; expected a line for each")

@@ -1,8 +1,8 @@
-"""WebDataset: tar archives, shards, whose members of one key are an event: 000012.truth.npy.gz, 000012.radon96.npy.gz, ...
+"""Shards of WebDataset: tar archives, whose members of one key, 000012.truth.npy.gz, 000012.radon96.npy.gz, are an event.
 
-A model's images are 000012.NAME.npy.gz, 000012.json says the rest (`record`); uncompressed, they end in .npy. Shards are of
-one split each, ``train-000003.tar``, so that a brace pattern or a glob names what is trained on. The same set makes the same
-bytes.
+The images of a model are 000012.NAME.npy.gz, and 000012.json is the event's record (`ExportSelection.record`); names of
+uncompressed arrays end in .npy. A shard holds events of one split, ``train-000003.tar``, so that a brace pattern or a glob
+selects the events for training. The same set gives the same bytes.
 """
 
 import gzip
@@ -15,51 +15,52 @@ from pathlib import Path
 from ...files import replacing
 from ...validation import strict_whole
 from ..event_set import Event
-from .arrays import npy
-from .layout import Chosen, Layout, Part, Row
-from .record import record
+from .arrays import npy_bytes
+from .layout import ExportLayout, ExportPart, ExportSelection, Row
 
 SHARD_BYTES = 10**9
-"""About how large a shard is unless its number of events is given."""
+"""Approximate size of a shard, bytes, where its number of events is not given."""
 
 
-class WebDataset(Layout):
-    """`events_per_shard`: how many events are in a shard; default: as many as make about a gigabyte uncompressed."""
+class WebDataset(ExportLayout):
+    """Tar archives of `events_per_shard` events, by default about a gigabyte; `uncompressed`: members without gzip."""
 
-    def __init__(self, chosen: Chosen, *, events_per_shard: int | None = None, uncompressed: bool = False) -> None:
-        super().__init__(chosen)
-        self.packed = not uncompressed
+    def __init__(
+        self, selection: ExportSelection, *, events_per_shard: int | None = None, uncompressed: bool = False
+    ) -> None:
+        super().__init__(selection)
+        self.compressed = not uncompressed
         if events_per_shard is None:
             events_per_shard = max(1, SHARD_BYTES // self.event_bytes)
         self.events_per_shard = strict_whole(events_per_shard, "events_per_shard", "a whole number of at least 1")
 
-    def parts(self, rows: list[Row]) -> list[Part]:
-        """A shard each."""
+    def parts(self, rows: list[Row]) -> list[ExportPart]:
+        """Return a part for each shard."""
         parts = []
         for split in dict.fromkeys(row["split"] for row in rows):
             members = [row["i"] for row in rows if row["split"] == split]
             for first in range(0, len(members), self.events_per_shard):
                 name = f"{split}-{first // self.events_per_shard:06d}.tar"
-                parts.append(Part((name,), tuple(members[first : first + self.events_per_shard])))
+                parts.append(ExportPart((name,), tuple(members[first : first + self.events_per_shard])))
         return parts
 
-    def write(self, part: Part, rows: list[Row], folder: Path, written: Callable[[], None]) -> None:
-        """Write a shard."""
-        path, kind = folder / part.files[0], tarfile.USTAR_FORMAT
-        with replacing(path) as temporary, tarfile.open(temporary, "w", format=kind) as tar:
+    def write(self, part: ExportPart, rows: list[Row], folder: Path, report_event: Callable[[], None]) -> None:
+        """Write a shard into a folder; call `report_event` after each event."""
+        path, tar_format = folder / part.files[0], tarfile.USTAR_FORMAT
+        with replacing(path) as temporary, tarfile.open(temporary, "w", format=tar_format) as tar:
             for i in part.events:
-                for name, content in self.contents(rows[i], self.chosen.events[i]):
-                    member = tarfile.TarInfo(name)  # of no time and nobody
+                for name, content in self.contents(rows[i], self.selection.events[i]):
+                    member = tarfile.TarInfo(name)  # without time and owner, so that the same set gives the same bytes
                     member.size = len(content)
                     tar.addfile(member, io.BytesIO(content))
-                written()
+                report_event()
 
     def contents(self, row: Row, event: Event) -> Iterator[tuple[str, bytes]]:
-        """The members of an event."""
+        """Yield the name and the content of each member of an event."""
         key = f"{row['i']:06d}"
-        for name, array in self.chosen.arrays(event):
-            if self.packed:  # of no time, so that the same set makes the same bytes
-                yield f"{key}.{name}.npy.gz", gzip.compress(npy(array), 4, mtime=0)
+        for name, array in self.selection.arrays(event):
+            if self.compressed:  # no time stamp, so that the same set gives the same bytes
+                yield f"{key}.{name}.npy.gz", gzip.compress(npy_bytes(array), 4, mtime=0)
             else:
-                yield f"{key}.{name}.npy", npy(array)
-        yield f"{key}.json", json.dumps(record(self.chosen, event)).encode()
+                yield f"{key}.{name}.npy", npy_bytes(array)
+        yield f"{key}.json", json.dumps(self.selection.record(event)).encode()

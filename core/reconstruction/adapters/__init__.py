@@ -10,7 +10,7 @@ from typing import Any
 
 from ...errors import needing
 from ...projector import Projector
-from ...projector.linear_operator import LinearOperator
+from ...rays.linear_operator import LinearOperator
 from ...validation import instance
 from .parallelproj_operator import ParallelprojOperator
 

@@ -6,7 +6,7 @@ from typing import Any, Self
 import numpy as np
 
 from ...arrays import ArrayOrTensor
-from ...projector.linear_operator import LinearOperator
+from ...rays.linear_operator import LinearOperator
 from ...validation import real_array
 
 

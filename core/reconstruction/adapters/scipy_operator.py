@@ -4,7 +4,7 @@ import numpy as np
 from scipy.sparse.linalg import LinearOperator as ScipyLinearOperator
 
 from ...arrays import Array
-from ...projector.linear_operator import LinearOperator
+from ...rays.linear_operator import LinearOperator
 
 
 class ScipyOperator(ScipyLinearOperator):

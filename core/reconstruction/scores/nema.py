@@ -8,7 +8,7 @@ import numpy as np
 from ...arrays import ArrayLike, Floats
 from ...errors import InputError
 from ...geometry.frames import checked_affine, moved
-from ...phantoms.nema import NemaBody, room, sphere_places
+from ...phantoms.nema import NemaBody, outline_distance, sphere_positions
 from ...validation import freeze, instance
 from ...volumes.resampling import values_at
 from ...volumes.volume import Volume, require_quantity
@@ -99,7 +99,7 @@ def nema_score(volume: Volume, phantom: NemaBody, pose: ArrayLike | None = None)
     around = np.array([(x, y, z) for z in _SLICES for x, y in places])
     true_contrast = phantom.sphere_activity / phantom.background - 1
     rows = []
-    for diameter, (x, y) in zip(phantom.sphere_diameters, sphere_places(), strict=True):
+    for diameter, (x, y) in zip(phantom.sphere_diameters, sphere_positions(), strict=True):
         if not diameter:
             continue
         place = (x, y, 0.0)
@@ -148,12 +148,12 @@ def _background_places(phantom: NemaBody) -> Floats:
         expected = f"a body that reaches from the spheres {-min(_SLICES):g} mm down"
         raise InputError(f"nema_score: expected {expected}, got {-low:g}")
     margin = _CLEAR + _LARGEST / 2
-    keep_off = [(d / 2, place) for d, place in zip(phantom.sphere_diameters, sphere_places(), strict=True) if d]
+    keep_off = [(d / 2, place) for d, place in zip(phantom.sphere_diameters, sphere_positions(), strict=True) if d]
     if phantom.lung_diameter:
         keep_off.append((phantom.lung_diameter / 2, (0.0, 0.0)))
     half = max(abs(edge) for corner in phantom.box for edge in corner[:2])
     axis = np.arange(-half, half + _STEP, _STEP)
-    places = np.array([(x, y) for x in axis for y in axis if room(x, y) >= margin])
+    places = np.array([(x, y) for x in axis for y in axis if outline_distance(x, y) >= margin])
     for radius, place in keep_off:
         places = places[np.linalg.norm(places - place, axis=1) >= radius + margin]
     if len(places) < _IN_SLICE:

@@ -1,4 +1,4 @@
-"""MetaImage, ITK's format: a header of ``Key = Value`` lines, and raw or zlib-compressed voxels behind or beside it.
+"""Read MetaImage, ITK's format: a header of ``Key = Value`` lines, and raw or zlib-compressed voxels behind or beside it.
 
 Only ITK and SimpleITK read it in Python, and they are too large to depend on (50 MB). The format is described at
 https://itk.org/Wiki/ITK/MetaIO/Documentation
@@ -14,7 +14,7 @@ from ...arrays import Floats
 from ...errors import InputError, expecting
 from ...files import require_file
 from ...geometry.frames import affine_matrix
-from .contents import RAS_FROM_LPS, Contents, refuse_several_files, require_voxels, warn_of_assumed
+from .contents import RAS_FROM_LPS, VolumeFileContents, require_one_data_file, require_voxels, warn_of_assumptions
 
 _TYPES = {
     "MET_CHAR": "i1", "MET_SHORT": "i2", "MET_INT": "i4", "MET_LONG": "i4", "MET_LONG_LONG": "i8",
@@ -25,31 +25,32 @@ _MILLIMETRES = {"mm": 1.0, "cm": 10.0, "um": 0.001, "?": 1.0}
 _LONGEST_HEADER = 1 << 16
 
 
-def read(path: Path) -> Contents:
-    """Read .mha, or .mhd and the files beside it."""
+def read(path: Path) -> VolumeFileContents:
+    """Read a .mha file, or a .mhd file and the file with its voxels."""
     with open(path, "rb") as file:
-        header = _header(file)
+        header = _read_header(file)
         sizes = _numbers(header, ("DimSize",), None)
         if not (sizes == np.floor(sizes)).all():
             raise InputError(f"DimSize = {header['DimSize']}: expected whole numbers")
         shape = tuple(int(n) for n in sizes)
         if int(header.get("ElementNumberOfChannels", 1)) != 1:
             raise InputError(f"expected one value per voxel, found {header['ElementNumberOfChannels']}")
-        kind = header.get("ElementType", "nothing")
-        if kind not in _TYPES:
-            raise InputError(f"ElementType {kind}: expected one of {', '.join(_TYPES)}")
-        big = _true(header.get("BinaryDataByteOrderMSB", header.get("ElementByteOrderMSB", "False")))
-        type_ = np.dtype((">" if big else "<") + _TYPES[kind])
-        require_voxels(shape, type_)
-        for key, plain in (("ElementToIntensityFunctionSlope", 1.0), ("ElementToIntensityFunctionOffset", 0.0)):
-            if _numbers(header, (key,), np.array([plain]))[0] != plain:
+        element_type = header.get("ElementType", "nothing")
+        if element_type not in _TYPES:
+            raise InputError(f"ElementType {element_type}: expected one of {', '.join(_TYPES)}")
+        is_big_endian = _is_true(header.get("BinaryDataByteOrderMSB", header.get("ElementByteOrderMSB", "False")))
+        dtype = np.dtype((">" if is_big_endian else "<") + _TYPES[element_type])
+        require_voxels(shape, dtype)
+        for key, neutral in (("ElementToIntensityFunctionSlope", 1.0), ("ElementToIntensityFunctionOffset", 0.0)):
+            if _numbers(header, (key,), np.array([neutral]))[0] != neutral:
                 raise InputError(f"{key} = {header[key]}: values that are to be scaled are not read")
-        values = np.frombuffer(_data(header, file, path, type_.itemsize * int(np.prod(shape, dtype=object))), type_)
-    return Contents(values.reshape(shape, order="F"), _affine(header, path))
+        n_bytes = dtype.itemsize * int(np.prod(shape, dtype=object))
+        values = np.frombuffer(_read_data(header, file, path, n_bytes), dtype)
+    return VolumeFileContents(values.reshape(shape, order="F"), _affine(header, path))
 
 
-def _header(file: BinaryIO) -> dict[str, str]:
-    """The keys and values up to the last key, ElementDataFile; the voxels may follow in `file`."""
+def _read_header(file: BinaryIO) -> dict[str, str]:
+    """Return the header's keys and values up to its last key, ElementDataFile; the voxels may follow in `file`."""
     header: dict[str, str] = {}
     while "ElementDataFile" not in header:
         line = file.readline(_LONGEST_HEADER)
@@ -62,62 +63,66 @@ def _header(file: BinaryIO) -> dict[str, str]:
     return header
 
 
-def _data(header: dict[str, str], file: BinaryIO, path: Path, size: int) -> bytes:
-    """The `size` bytes of voxels."""
-    where = header["ElementDataFile"]
-    refuse_several_files("ElementDataFile", where)
-    if not _true(header.get("BinaryData", "True")):
+def _read_data(header: dict[str, str], file: BinaryIO, path: Path, size: int) -> bytes:
+    """Return the `size` bytes of the voxels, from the open header's `file` or the file that the header names."""
+    name = header["ElementDataFile"]
+    require_one_data_file("ElementDataFile", name)
+    if not _is_true(header.get("BinaryData", "True")):
         raise InputError("BinaryData = False: voxels written as text are not read")
-    if where.upper() == "LOCAL":
-        return _unpacked(header, file, size, "it")
-    beside = path.parent / where
-    if not beside.exists():
-        raise InputError(f"its voxels are in {where}, which is not beside it")
-    with open(require_file(beside), "rb") as raw:
-        return _unpacked(header, raw, size, where)
+    if name.upper() == "LOCAL":
+        return _decompress(header, file, size, "it")
+    data_path = path.parent / name
+    if not data_path.exists():
+        raise InputError(f"its voxels are in {name}, which is not beside it")
+    with open(require_file(data_path), "rb") as data_file:
+        return _decompress(header, data_file, size, name)
 
 
-def _unpacked(header: dict[str, str], file: BinaryIO, size: int, name: str) -> bytes:
+def _decompress(header: dict[str, str], file: BinaryIO, size: int, name: str) -> bytes:
+    """Return the `size` bytes of voxels that follow in `file`, decompressed if need be; messages begin with `name`."""
     skip = int(header.get("HeaderSize", 0))
-    if _true(header.get("CompressedData", "False")):
-        # One byte more than expected, to notice too much data.
-        packed = zlib.decompressobj(zlib.MAX_WBITS | 32)
-        data = packed.decompress(file.read(), size + 1)
-        if len(data) == size and not packed.eof:
+    if _is_true(header.get("CompressedData", "False")):
+        # One byte more than expected is requested, so that surplus data are noticed.
+        decompressor = zlib.decompressobj(zlib.MAX_WBITS | 32)
+        data = decompressor.decompress(file.read(), size + 1)
+        if len(data) == size and not decompressor.eof:
             raise InputError(f"{name} ends before the checksum of its voxels")
     else:
-        if skip == -1:  # the voxels end the file
+        if skip == -1:  # the voxels are the last bytes of the file
             file.seek(-size, 2)
         elif skip:
             file.seek(skip, 1)
         data = file.read(size + 1)
     if len(data) != size:
-        more = "more" if len(data) > size else len(data)
-        raise InputError(f"expected {size} bytes of voxels (DimSize x ElementType), {name} holds {more}")
+        actual = "more" if len(data) > size else len(data)
+        raise InputError(f"expected {size} bytes of voxels (DimSize x ElementType), {name} holds {actual}")
     return data
 
 
 def _affine(header: dict[str, str], path: Path) -> Floats:
-    """Index to world mm, with a warning of what the header does not say."""
-    spacing, offset = ("ElementSpacing", "ElementSize"), ("Offset", "Position", "Origin")
-    turned = ("TransformMatrix", "Rotation", "Orientation")
-    words = header.get("AnatomicalOrientation", "RAI")  # ITK writes it beside the matrix, which takes precedence
-    if not header.keys() & set(turned) and words.upper() not in ("RAI", "???"):
-        raise InputError(f"AnatomicalOrientation = {words} without a TransformMatrix: expected the matrix, or RAI")
+    """Return the affine world-from-index, mm, in RAS; warn of assumptions about missing fields."""
+    spacing_keys, offset_keys = ("ElementSpacing", "ElementSize"), ("Offset", "Position", "Origin")
+    matrix_keys = ("TransformMatrix", "Rotation", "Orientation")
+    letters = header.get("AnatomicalOrientation", "RAI")  # ITK writes it beside the matrix, which takes precedence
+    if not header.keys() & set(matrix_keys) and letters.upper() not in ("RAI", "???"):
+        raise InputError(f"AnatomicalOrientation = {letters} without a TransformMatrix: expected the matrix, or RAI")
     # Row i of the matrix is the direction of axis i.
-    directions = _numbers(header, turned, np.eye(3).ravel()).reshape(3, 3)
-    axes, origin = directions.T * _numbers(header, spacing, np.ones(3)), _numbers(header, offset, np.zeros(3))
+    directions = _numbers(header, matrix_keys, np.eye(3).ravel()).reshape(3, 3)
+    axes, origin = directions.T * _numbers(header, spacing_keys, np.ones(3)), _numbers(header, offset_keys, np.zeros(3))
     unit = header.get("DistanceUnits", "?")
     if unit not in _MILLIMETRES:
         raise InputError(f"DistanceUnits = {unit}: expected mm, cm or um")
-    assumed = ["voxels of 1 mm"] * (not header.keys() & set(spacing))
-    assumed += ["the first voxel's centre at (0, 0, 0)"] * (not header.keys() & set(offset))
-    warn_of_assumed(path, assumed)
+    assumptions = ["voxels of 1 mm"] * (not header.keys() & set(spacing_keys))
+    assumptions += ["the first voxel's centre at (0, 0, 0)"] * (not header.keys() & set(offset_keys))
+    warn_of_assumptions(path, assumptions)
     return RAS_FROM_LPS @ affine_matrix(axes * _MILLIMETRES[unit], origin * _MILLIMETRES[unit])
 
 
 def _numbers(header: dict[str, str], keys: tuple[str, ...], default: Floats | None) -> Floats:
-    """The numbers of the first of `keys` in the header, as many as `default` has."""
+    """Return the numbers of the first of `keys` in the header, as many as `default` has, or `default` if all are missing.
+
+    Without a default, any number of numbers is allowed, and a missing key raises `InputError`.
+    """
     text = next((header[key] for key in keys if key in header), None)
     if text is None:
         if default is None:
@@ -130,5 +135,6 @@ def _numbers(header: dict[str, str], keys: tuple[str, ...], default: Floats | No
     return numbers
 
 
-def _true(text: str) -> bool:
+def _is_true(text: str) -> bool:
+    """Return whether a header's `text` means yes."""
     return text.strip().lower() in ("true", "t", "1", "yes")

@@ -1,4 +1,4 @@
-"""NRRD, by pynrrd."""
+"""Read and write NRRD, by pynrrd."""
 
 from pathlib import Path
 from typing import Any
@@ -9,76 +9,77 @@ from ...errors import InputError, first_line
 from ...files import require_file
 from ...geometry.frames import affine_matrix
 from ..volume import Volume
-from .contents import Contents, refuse_several_files, require_voxels, warn_of_assumed
+from .contents import VolumeFileContents, require_one_data_file, require_voxels, warn_of_assumptions
 
-# Signs that turn a space's axes to right, anterior, superior, which are assumed for a space without a name.
+# Signs that convert a space's axes to right, anterior, superior. A space without a name is assumed to have these axes.
 _SPACES: dict[str | None, tuple[int, int, int]] = {
     **dict.fromkeys((None, "right-anterior-superior", "ras", "3d-right-handed"), (1, 1, 1)),
     **dict.fromkeys(("left-anterior-superior", "las"), (-1, 1, 1)),
     **dict.fromkeys(("left-posterior-superior", "lps"), (-1, -1, 1)),
 }
-# Units of length. An empty one is unknown and, like a missing one, taken as mm.
+# Millimetres per unit of length. An empty or missing unit is taken as mm.
 _MILLIMETRES = {
     **dict.fromkeys(("", "mm", "millimeter", "millimeters", "millimetre", "millimetres"), 1.0),
     **dict.fromkeys(("cm", "centimeter", "centimeters", "centimetre", "centimetres"), 10.0),
     **dict.fromkeys(("m", "meter", "meters", "metre", "metres"), 1000.0),
     **dict.fromkeys(("um", "µm", "micron", "microns", "micrometer", "micrometers"), 0.001),
 }
-# Kinds of a spatial axis; "???" and "none" say nothing.
+# Kinds of an axis that are, or in the case of "none" and "???" may be, spatial.
 _SPATIAL = ("domain", "space", "none", "???")
 _UNITS = {
     **dict.fromkeys(("hounsfield", "hounsfield unit", "hounsfield units", "hu"), "HU"),
     **dict.fromkeys(("mm-1", "mm^-1"), "1/mm"),
 }
-# Fields about the values or their places, by the names that pynrrd understands.
+# Field names that the format allows, and pynrrd's names for them.
 _SYNONYMS = {
     "axismins": "axis mins", "axismaxs": "axis maxs", "centers": "centerings", "oldmin": "old min", "oldmax": "old max",
     "lineskip": "line skip", "byteskip": "byte skip", "datafile": "data file",
 }  # fmt: skip
+# Fields of the header that this reader uses, or that change the meaning of values or positions.
 _FIELDS = (
     "space", "space dimension", "space units", "space origin", "space directions", "spacings", "units", "kinds",
     "sample units", *_SYNONYMS.values(),
 )  # fmt: skip
-_SAME = 1e-6  # relative difference of two statements of a length that rounded decimals explain
+_SAME = 1e-6  # relative difference of two lengths that is explained by rounded decimals
 
 
-def read(path: Path) -> Contents:
-    """Read .nrrd, or .nhdr and the file beside it."""
+def read(path: Path) -> VolumeFileContents:
+    """Read a .nrrd file, or a .nhdr file and the file with its voxels."""
     import nrrd
 
-    header: dict[str, Any] = {}  # with one name for each field
+    header: dict[str, Any] = {}
     for name, value in nrrd.read_header(str(path)).items():
-        known = _SYNONYMS.get(name.lower(), name.lower())
-        if known in _FIELDS and name != name.lower():  # pynrrd would ignore it
-            raise InputError(f"field {name!r}: expected it in small letters, {known!r}")
-        header[known if known in _FIELDS else name] = value
+        field = _SYNONYMS.get(name.lower(), name.lower())
+        if field in _FIELDS and name != name.lower():  # pynrrd would ignore it
+            raise InputError(f"field {name!r}: expected it in small letters, {field!r}")
+        header[field if field in _FIELDS else name] = value
     for name in ("type", "sizes"):
         if name not in header:
             raise InputError(f"it has no field {name}: it is damaged or ends early")
-    kind = header["type"]
-    if kind == "block":
+    value_type = header["type"]
+    if value_type == "block":
         raise InputError("expected real numbers, found blocks of bytes")
-    require_voxels(header["sizes"], np.dtype(np.float64 if kind == "double" else np.float32))
-    # Whole numbers between "old min" and "old max" encode others.
-    ends = [header[name] for name in ("old min", "old max") if np.isfinite(float(header.get(name, np.nan)))]
-    if ends and kind not in ("float", "double"):
+    require_voxels(header["sizes"], np.dtype(np.float64 if value_type == "double" else np.float32))
+    # Whole numbers with an "old min" or "old max" encode real numbers between these.
+    limits = [header[name] for name in ("old min", "old max") if np.isfinite(float(header.get(name, np.nan)))]
+    if limits and value_type not in ("float", "double"):
         raise InputError("old min and old max: quantized values are not read; unquantize them (unu unquantize)")
-    beside = header.get("data file", "")
-    refuse_several_files("data file:", beside)
-    if beside and (path.parent / beside).exists():
-        require_file(path.parent / beside)
+    data_file = header.get("data file", "")
+    require_one_data_file("data file:", data_file)
+    if data_file and (path.parent / data_file).exists():
+        require_file(path.parent / data_file)
     affine = _affine(header, path)
     try:
         array, _ = nrrd.read(str(path))
-    except Exception as error:  # pynrrd says little or nothing of missing data
+    except Exception as error:  # pynrrd's message says little or nothing about missing data
         sizes = " x ".join(map(str, header["sizes"]))
         raise InputError(f"its data are damaged or end early; expected {sizes} voxels ({first_line(error)})") from error
     unit = header.get("unit") or header.get("sample units")
-    return Contents(array, affine, header.get("quantity"), _UNITS.get(unit.lower(), unit) if unit else None)
+    return VolumeFileContents(array, affine, header.get("quantity"), _UNITS.get(unit.lower(), unit) if unit else None)
 
 
 def write(volume: Volume, temporary: Path) -> None:
-    """Write .nrrd with the exact affine."""
+    """Write a volume as .nrrd, with its exact affine, to the path `temporary`."""
     import nrrd
 
     affine = volume.grid.affine
@@ -97,7 +98,7 @@ def write(volume: Volume, temporary: Path) -> None:
 
 
 def _affine(header: dict[str, Any], path: Path) -> np.ndarray:
-    """Index to world mm, with a warning of what the header does not say."""
+    """Return the affine world-from-index, mm, in RAS; warn of assumptions about missing fields."""
     space = header.get("space")
     name = None if space is None else space.lower()
     if name not in _SPACES:
@@ -106,20 +107,21 @@ def _affine(header: dict[str, Any], path: Path) -> np.ndarray:
     kinds = header.get("kinds", ["space"] * 3)
     if any(kind.lower() not in _SPATIAL for kind in kinds):
         raise InputError(f"kinds {' '.join(kinds)}: expected three axes of space or domain")
-    assumed = [] if name else ["axes right, anterior, superior"]
-    space_units, units = _scales(header, "space units"), _scales(header, "units")
+    assumptions = [] if name else ["axes right, anterior, superior"]
+    space_units, units = _unit_lengths(header, "space units"), _unit_lengths(header, "units")
+    # `first` is the first voxel's centre according to the axis mins, or None.
     scale, first = np.ones(3) if space_units is None else space_units, None
     if "space directions" in header:
         if space_units is None and units is not None and np.ptp(units) == 0:
             scale = units
         elif units is not None and np.any(units != scale):
             raise InputError("units: the axes' own differ from the space's; expected space units alone")
-        axes = scale[:, None] * _of_space(header, np.asarray(header["space directions"], np.float64))
+        axes = scale[:, None] * _space_axes(header, np.asarray(header["space directions"], np.float64))
     else:
-        spacings, first, of_axes = _of_axes(header)
-        assumed += of_axes
-        own = scale if units is None else units
-        axes, first = np.diag(spacings * own), None if first is None else first * own
+        spacings, first, axis_assumptions = _axis_positions(header)
+        assumptions += axis_assumptions
+        axis_scale = scale if units is None else units
+        axes, first = np.diag(spacings * axis_scale), None if first is None else first * axis_scale
     if "space origin" in header:
         origin = scale * np.asarray(header["space origin"], np.float64)
         if first is not None and np.any(np.abs(first - origin) > _SAME * np.abs(np.diag(axes))):
@@ -127,14 +129,17 @@ def _affine(header: dict[str, Any], path: Path) -> np.ndarray:
     elif first is not None:
         origin = first
     else:
-        assumed.append("the first voxel's centre at (0, 0, 0)")
+        assumptions.append("the first voxel's centre at (0, 0, 0)")
         origin = np.zeros(3)
-    warn_of_assumed(path, assumed)
+    warn_of_assumptions(path, assumptions)
     return np.diag([*map(float, _SPACES[name]), 1.0]) @ affine_matrix(axes, origin)
 
 
-def _of_space(header: dict[str, Any], directions: np.ndarray) -> np.ndarray:
-    """The directions as columns. The format allows no other lengths of the axes with them, so those must agree."""
+def _space_axes(header: dict[str, Any], directions: np.ndarray) -> np.ndarray:
+    """Return the steps from voxel to voxel along each axis as columns, from the field "space directions" (rows).
+
+    The format does not allow other statements of the axes' lengths beside it: they must agree.
+    """
     if directions.shape != (3, 3) or not np.isfinite(directions).all():
         raise InputError("space directions: expected a vector for each of three axes")
     if any(np.isfinite(_numbers(header, name)).any() for name in ("axis mins", "axis maxs")):
@@ -145,57 +150,58 @@ def _of_space(header: dict[str, Any], directions: np.ndarray) -> np.ndarray:
     return directions.T
 
 
-def _of_axes(header: dict[str, Any]) -> tuple[np.ndarray, np.ndarray | None, list[str]]:
-    """The axes' own spacings, the centre of the first voxel (or None), and what has been assumed.
+def _axis_positions(header: dict[str, Any]) -> tuple[np.ndarray, np.ndarray | None, list[str]]:
+    """Return the axes' spacings (3,), the first voxel's centre (3,) or None, and assumptions, without space directions.
 
-    "axis mins" and "axis maxs" are the outer faces of the first and last voxels of a cell-centred axis, and their
-    centres on a node-centred one.
+    On a cell-centred axis, "axis mins" and "axis maxs" are the outer faces of the first and last voxel; on a node-centred
+    axis, they are these voxels' centres.
     """
     spacings, low, high = (_numbers(header, name) for name in ("spacings", "axis mins", "axis maxs"))
-    assumed: list[str] = []
+    assumptions: list[str] = []
     if not np.isfinite(low).any():
         if np.isfinite(high).any():
             raise InputError("axis maxs: expected axis mins beside them")
         if np.isfinite(spacings).any():
-            return _all_of(spacings, "spacings"), None, assumed
+            return _require_finite(spacings, "spacings"), None, assumptions
         return np.ones(3), None, ["voxels of 1 mm"]
-    low = _all_of(low, "axis mins")
+    low = _require_finite(low, "axis mins")
     centerings = header.get("centerings", ["???"] * 3)
     centerings = [c.lower() for c in (centerings.split() if isinstance(centerings, str) else centerings)]
     if len(centerings) != 3 or not set(centerings) <= {"cell", "node", "none", "???"}:
         raise InputError(f"centerings {' '.join(centerings)}: expected cell or node for each of three axes")
     if not set(centerings) <= {"cell", "node"}:
-        assumed = ["axis mins at the first voxel's face (centerings: cell)"]
-    node = np.array([c == "node" for c in centerings])
+        assumptions = ["axis mins at the first voxel's face (centerings: cell)"]
+    is_node = np.array([c == "node" for c in centerings])
     if np.isfinite(high).any():
-        steps = np.asarray(header["sizes"]) - node
-        if np.any(steps < 1):
+        n_steps = np.asarray(header["sizes"]) - is_node
+        if np.any(n_steps < 1):
             raise InputError("axis maxs: an axis of one node has no spacing; expected spacings and axis mins")
-        between = (_all_of(high, "axis maxs") - low) / steps
-        if np.any(np.abs(spacings - between) > _SAME * np.abs(between)):
-            lengths = f"{_text(spacings)} and {_text(between)}"
+        steps = (_require_finite(high, "axis maxs") - low) / n_steps
+        if np.any(np.abs(spacings - steps) > _SAME * np.abs(steps)):
+            lengths = f"{_text(spacings)} and {_text(steps)}"
             raise InputError(f"spacings and axis mins and maxs say different lengths: {lengths}")
-        spacings = between
-    spacings = _all_of(spacings, "spacings")
-    return spacings, low + np.where(node, 0.0, spacings / 2), assumed
+        spacings = steps
+    spacings = _require_finite(spacings, "spacings")
+    return spacings, low + np.where(is_node, 0.0, spacings / 2), assumptions
 
 
 def _numbers(header: dict[str, Any], name: str) -> np.ndarray:
-    """A field's three numbers, with NaN for those that are missing."""
+    """Return the three numbers of a field, NaN for missing ones."""
     numbers = np.asarray(header.get(name, [np.nan] * 3), np.float64)
     if numbers.shape != (3,):
         raise InputError(f"{name}: expected 3 numbers, got {_text(np.atleast_1d(numbers))}")
     return numbers
 
 
-def _all_of(numbers: np.ndarray, name: str) -> np.ndarray:
+def _require_finite(numbers: np.ndarray, name: str) -> np.ndarray:
+    """Return the three numbers of the field `name`, or raise `InputError` if one is missing."""
     if not np.isfinite(numbers).all():
         raise InputError(f"{name}: expected 3 numbers, got {_text(numbers)}")
     return numbers
 
 
-def _scales(header: dict[str, Any], name: str) -> np.ndarray | None:
-    """A field's three units of length, in mm, or None if it is not there."""
+def _unit_lengths(header: dict[str, Any], name: str) -> np.ndarray | None:
+    """Return the three units of length of a field, mm, or None if the field is missing."""
     units = header.get(name)
     if units is None:
         return None
@@ -205,4 +211,5 @@ def _scales(header: dict[str, Any], name: str) -> np.ndarray | None:
 
 
 def _text(numbers: np.ndarray) -> str:
+    """Return numbers as text for messages."""
     return " ".join(f"{x:g}" for x in numbers.ravel())

@@ -1,4 +1,4 @@
-"""numpy's files: npz with the exact affine, and bare npy arrays."""
+"""Read and write numpy's files: .npz archives with the exact affine; read bare .npy arrays."""
 
 import io
 from pathlib import Path
@@ -9,54 +9,54 @@ import numpy as np
 from ...arrays import Array
 from ...errors import InputError
 from ..volume import Volume
-from .contents import Contents
+from .contents import VolumeFileContents
 
 
-def read(path: Path) -> Contents:
-    """Read .npz with the arrays array, affine, quantity and optionally unit; or .npy, which has no affine."""
+def read(path: Path) -> VolumeFileContents:
+    """Read a .npz file with the arrays array, affine, quantity and optionally unit, or a .npy file, without an affine."""
     arrays = load(path, {"array", "affine", "quantity", "unit"})
     if path.suffix.lower() == ".npy":
-        return Contents(arrays[""], None)
+        return VolumeFileContents(arrays[""], None)
     missing = {"array", "affine", "quantity"} - set(arrays)
     if missing:
         raise InputError(f"expected the arrays array, affine and quantity; {', '.join(sorted(missing))} not found")
     unit = str(arrays["unit"]) if "unit" in arrays else None
-    return Contents(arrays["array"], arrays["affine"], str(arrays["quantity"]), unit)
+    return VolumeFileContents(arrays["array"], arrays["affine"], str(arrays["quantity"]), unit)
 
 
 def write(volume: Volume, temporary: Path) -> None:
-    """Write .npz."""
+    """Write a volume as .npz to the path `temporary`."""
     arrays = {"array": volume.array, "affine": volume.grid.affine, "quantity": volume.quantity, "unit": volume.unit}
     arrays |= {"note": volume.note} if volume.note else {}
-    temporary.write_bytes(packed(arrays))
+    temporary.write_bytes(pack_npz(arrays))
 
 
-def packed(arrays: dict[str, Any]) -> memoryview:
-    """The bytes of an .npz of these arrays, compressed."""
+def pack_npz(arrays: dict[str, Any]) -> memoryview:
+    """Return the bytes of a compressed .npz archive of these arrays."""
     memory = io.BytesIO()
     np.savez_compressed(memory, **arrays)  # type: ignore[arg-type]
     return memory.getbuffer()
 
 
-def load(path: Path, wanted: set[str] | None = None) -> dict[str, Array]:
-    """The arrays of an .npz by name, or those that are `wanted`; of an .npy its array, with the name "".
+def load(path: Path, names: set[str] | None = None) -> dict[str, Array]:
+    """Return the arrays of an .npz file by name, all or those of `names`; of an .npy file its array, by the name "".
 
     Each member of an .npz is read to its end, where its checksum is.
     """
-    with open(path, "rb") as opened:  # not by numpy, which leaves a damaged archive open
-        if not opened.read(6).startswith((b"\x93NUMPY", b"PK")):  # numpy would take it for pickled objects
+    with open(path, "rb") as file:  # not opened by numpy, which leaves a damaged archive open
+        if not file.read(6).startswith((b"\x93NUMPY", b"PK")):  # numpy would take other bytes for pickled objects
             raise InputError("not a file of numpy")
-        opened.seek(0)
-        found = np.load(opened, allow_pickle=False)
-        is_single = isinstance(found, np.ndarray)
+        file.seek(0)
+        archive = np.load(file, allow_pickle=False)
+        is_single = isinstance(archive, np.ndarray)
         if is_single != (path.suffix.lower() == ".npy"):
             kinds = ("a single array", "an npz archive")
             raise InputError("expected {}, found {}".format(*(kinds[::-1] if is_single else kinds)))
         if is_single:
-            return {"": found}
+            return {"": archive}
         arrays = {}
-        for name in found.files if wanted is None else wanted.intersection(found.files):
-            with found.zip.open(f"{name}.npy") as member:
+        for name in archive.files if names is None else names.intersection(archive.files):
+            with archive.zip.open(f"{name}.npy") as member:
                 arrays[name] = np.lib.format.read_array(member, allow_pickle=False)  # type: ignore[no-untyped-call]
                 if member.read(1):
                     raise InputError(f"{name}: expected nothing behind its array")

@@ -1,4 +1,4 @@
-"""Triangle meshes, their files, and the check that they are closed."""
+"""Triangle meshes, their files, and the check that a mesh is closed."""
 
 import os
 from dataclasses import dataclass
@@ -13,30 +13,29 @@ from ...files import AnyPath, replacing, require_ending, require_file
 from ...validation import freeze, one_of, real_array
 
 MESH_FORMATS = (".stl", ".obj", ".ply", ".glb")
-"""Suffixes of mesh files."""
+"""Name endings of mesh files."""
 MILLIMETRES = {"um": 0.001, "mm": 1.0, "cm": 10.0, "m": 1000.0, "in": 25.4}
-"""Millimetres per unit of length of a mesh file."""
+"""Millimetres per unit of length of a mesh file, by unit."""
 
-# Corners closer than this fraction of the mesh's size are one corner: files keep six digits or more.
+# Corners closer to each other than this fraction of the mesh's size are one corner: files have six digits or more.
 _SAME_POINT = 1e-7
 
 
 @dataclass(frozen=True, eq=False)
 class Mesh:
-    """A surface of triangles: vertices (V, 3), world mm, and their indices in faces (F, 3).
-
-    Corners run counter-clockwise as seen from outside.
-    """
+    """A surface of triangles."""
 
     vertices: Floats
+    """Vertices (V, 3), world mm."""
     faces: Integers
+    """Indices (F, 3) of each triangle's corners in `vertices`, counter-clockwise as seen from outside."""
 
     def __post_init__(self) -> None:
         vertices = real_array(self.vertices, "mesh vertices", (None, 3))
         faces = np.asarray(self.faces)
         if faces.ndim != 2 or faces.shape[1] != 3 or faces.dtype.kind not in "iu":
-            found = f"{faces.dtype} of shape {faces.shape}"
-            raise InputError(f"mesh faces: expected F x 3 indices of vertices, got {found}")
+            actual = f"{faces.dtype} of shape {faces.shape}"
+            raise InputError(f"mesh faces: expected F x 3 indices of vertices, got {actual}")
         if len(faces) == 0:
             raise InputError("mesh: it has no faces")
         if faces.min() < 0 or faces.max() >= len(vertices):
@@ -46,16 +45,16 @@ class Mesh:
 
     @property
     def volume(self) -> float:
-        """Enclosed volume, mm^3: positive where the faces look outwards."""
-        # About the mesh's middle: far from the origin no digits are lost.
+        """Enclosed volume, mm^3; positive if the faces look outwards."""
+        # Relative to the mean vertex, so that no digits are lost far from the origin.
         a, b, c = ((self.vertices - self.vertices.mean(axis=0))[self.faces[:, i]] for i in range(3))
         return float(np.einsum("ij,ij->", a, np.cross(b, c)) / 6)
 
 
 def read_mesh(path: AnyPath, unit: str | None = None) -> Mesh:
-    """Read the triangles of a mesh file, all its objects as one: .stl, .obj, .ply or .glb.
+    """Read a mesh file, .stl, .obj, .ply or .glb, with the triangles of all its objects as one mesh.
 
-    `unit` is that of the file's lengths, one of `MILLIMETRES`. Default: mm; of .glb m, as its standard says.
+    `unit` is the unit of length in the file, one of `MILLIMETRES`. Default: mm; for .glb m, as its standard says.
     """
     import trimesh
 
@@ -67,7 +66,7 @@ def read_mesh(path: AnyPath, unit: str | None = None) -> Mesh:
 
 
 def write_mesh(mesh: Mesh, path: AnyPath, unit: str | None = None) -> None:
-    """Write a mesh as .stl, .obj, .ply or .glb; `unit` as for `read_mesh`."""
+    """Write a mesh as .stl, .obj, .ply or .glb; `unit` is the unit of length in the file, see `read_mesh`."""
     import trimesh
 
     path = Path(path)
@@ -77,53 +76,53 @@ def write_mesh(mesh: Mesh, path: AnyPath, unit: str | None = None) -> None:
         trimesh.Trimesh(mesh.vertices / factor, mesh.faces, process=False).export(temporary, file_type=suffix[1:])
 
 
-def as_mesh(given: Any) -> Mesh:
-    """A `Mesh` from a mesh, a trimesh mesh or scene, (vertices, faces), or the path of a file."""
-    if isinstance(given, Mesh):
-        return given
-    if isinstance(given, str | os.PathLike):
-        return read_mesh(given)
-    if hasattr(given, "to_mesh"):  # a trimesh scene
-        given = given.to_mesh()
-    if hasattr(given, "vertices") and hasattr(given, "faces"):
-        return Mesh(given.vertices, given.faces)
-    refusal = f"mesh: expected a mesh, vertices and faces, or a path, got {type(given).__name__}"
+def as_mesh(source: Any) -> Mesh:
+    """Return a `Mesh` from a mesh, a trimesh mesh or scene, (vertices, faces), or the path of a file."""
+    if isinstance(source, Mesh):
+        return source
+    if isinstance(source, str | os.PathLike):
+        return read_mesh(source)
+    if hasattr(source, "to_mesh"):  # a trimesh scene
+        source = source.to_mesh()
+    if hasattr(source, "vertices") and hasattr(source, "faces"):
+        return Mesh(source.vertices, source.faces)
+    refusal = f"mesh: expected a mesh, vertices and faces, or a path, got {type(source).__name__}"
     with expecting(refusal, TypeError, ValueError):
-        vertices, faces = given
+        vertices, faces = source
     return Mesh(vertices, faces)
 
 
 def require_closed(mesh: Mesh) -> None:
-    """Refuse a surface that is open or whose faces look to different sides; the message says where."""
+    """Raise `InputError` for a surface that is open or whose faces look to different sides; the message says where."""
     vertices = mesh.vertices
     size = float(np.ptp(vertices, axis=0).max())
-    # In .stl and other files every triangle has its own copy of its corners.
+    # In .stl and other files every triangle has its own copy of its corners: equal corners are merged.
     steps = np.round((vertices - vertices.min(axis=0)) / (_SAME_POINT * size or 1.0))
     order = np.lexsort(steps.T)
-    new = np.append(True, (np.diff(steps[order], axis=0) != 0).any(axis=1))
-    first, merged = order[new], np.empty(len(vertices), np.int64)
-    merged[order] = np.cumsum(new) - 1
+    is_new = np.append(True, (np.diff(steps[order], axis=0) != 0).any(axis=1))
+    first, merged = order[is_new], np.empty(len(vertices), np.int64)
+    merged[order] = np.cumsum(is_new) - 1
     corners = merged[mesh.faces]
-    # A triangle two of whose corners are one has no area, and its edges cancel.
+    # A triangle with two equal corners has no area, and its edges cancel.
     corners = corners[(corners != np.roll(corners, 1, axis=1)).all(axis=1)]
     start, end = corners.ravel(), np.roll(corners, -1, axis=1).ravel()
     key, index = np.unique(np.minimum(start, end) * len(first) + np.maximum(start, end), return_inverse=True)
     edge = np.stack(np.divmod(key, len(first)))
-    uses = np.bincount(index)
-    turns = np.bincount(index, np.where(start < end, 1, -1))
-    for wrong, what, remedy in (
-        (uses % 2, "it is not closed", "expected an even number of faces at each edge: fill the holes"),
-        (turns, "faces look to different sides", "expected all to look outwards: recalculate the normals"),
+    n_faces = np.bincount(index)
+    direction_sum = np.bincount(index, np.where(start < end, 1, -1))  # 0 if faces run along the edge in both directions
+    for is_wrong, fault, remedy in (
+        (n_faces % 2, "it is not closed", "expected an even number of faces at each edge: fill the holes"),
+        (direction_sum, "faces look to different sides", "expected all to look outwards: recalculate the normals"),
     ):
-        bad = np.flatnonzero(wrong)
-        if len(bad):
-            x, y, z = vertices[first[edge[:, bad[0]]]].mean(axis=0)
-            count = f"{len(bad)} edge{'s' * (len(bad) > 1)}"
-            raise InputError(f"mesh: {what} at {count}, the first at ({x:.4g}, {y:.4g}, {z:.4g}) mm; {remedy}")
+        wrong = np.flatnonzero(is_wrong)
+        if len(wrong):
+            x, y, z = vertices[first[edge[:, wrong[0]]]].mean(axis=0)
+            count = f"{len(wrong)} edge{'s' * (len(wrong) > 1)}"
+            raise InputError(f"mesh: {fault} at {count}, the first at ({x:.4g}, {y:.4g}, {z:.4g}) mm; {remedy}")
 
 
 def _suffix_and_factor(path: Path, unit: str | None) -> tuple[str, float]:
-    """The path's suffix, and the millimetres per unit of length of the file."""
+    """Return the path's ending, and the millimetres per unit of length of the file."""
     suffix = require_ending(path, MESH_FORMATS)
     unit = unit or ("m" if suffix == ".glb" else "mm")
     one_of(unit, MILLIMETRES, "unit")

@@ -1,10 +1,11 @@
-"""Closed meshes to volumes: the share of every voxel that lies inside, exactly.
+"""Voxelisation of closed meshes: the exact fraction of every voxel that lies inside.
 
-The triangles are cut at all planes between voxels. Each piece then bounds a prism that reaches from it to the end of its
-column of voxels: it covers a known part of the piece's own voxel, and the piece's area of each further voxel. The prisms,
-summed with the sign of the side to which the piece looks, give the mean winding number of each voxel (the divergence
-theorem). That is the covered share, unless the mesh intersects itself: a voxel there may hold parts of winding number 0 and
-2. In columns of voxels with such places the share is the mean over many rays along z of the length inside.
+The triangles are cut at all planes between voxels. Each piece then bounds a prism that extends from it along z to the end of
+its column of voxels: the prism covers a known part of the piece's own voxel, and the piece's projected area of each further
+voxel. The sum of the prisms, with the sign of the side to which the piece looks, is the mean winding number of each voxel
+(the divergence theorem). It equals the covered fraction, unless the mesh intersects itself: a voxel there may contain parts
+of winding number 0 and 2. In columns of voxels with such parts, the fraction is the mean length inside along many rays
+parallel to z.
 """
 
 import math
@@ -24,11 +25,11 @@ from ...validation import freeze, instance, one_for_all
 from ..volume import Volume
 from .mesh import Mesh, as_mesh, require_closed
 
-_VOXELS, _POLYGONS = 1 << 21, 1 << 14  # at once
-# Where a mesh intersects itself: rays for all of it, their largest distance in voxels, and pairs of triangle and ray to
-# test at once.
+_VOXELS, _POLYGONS = 1 << 21, 1 << 14  # processed at a time
+# For meshes that intersect themselves: number of rays, their largest distance in voxels, and pairs of triangle and ray that
+# are tested at a time.
 _RAYS, _STEP, _CANDIDATES = 1 << 18, 0.25, 1 << 20
-_ROUNDING = 1e-9  # shares this close to 0 and 1 are 0 and 1
+_ROUNDING = 1e-9  # fractions this close to 0 and 1 are 0 and 1
 
 
 def voxelize_mesh(
@@ -38,49 +39,49 @@ def voxelize_mesh(
     quantity: str = "activity",
     progress: Progress | None = None,
 ) -> Volume:
-    """A volume filled by one closed mesh or by several; parts outside the grid are cut off.
+    """Return a volume filled by one or several closed meshes; parts outside the grid are cut off.
 
     Parameters
     ----------
     mesh
         A `Mesh`, a trimesh mesh or scene, ``(vertices (V, 3), faces (F, 3))`` in world mm, or the path of a file (see
-        `read_mesh`); or a list of these, in which later ones replace what they cover of earlier ones. Messages say
-        where a mesh is open or its faces look to different sides.
+        `read_mesh`); or a list of these, in which later meshes replace the values of earlier ones. Messages say where a
+        mesh is open or its faces look to different sides.
     grid
-        Where the voxels are; any affine.
+        Grid of the volume, with any affine.
     value
-        Inside, in the quantity's unit: one number, or one for each mesh. Outside, the volume is 0.
+        Value inside, in the quantity's unit: one number, or one for each mesh. Outside, the volume is 0.
     quantity
-        What the values are.
+        Quantity of the values.
     progress
         Called as ``progress(done, total)``; may raise `Cancelled`.
     """
     instance(grid, Grid, "voxelize_mesh")
-    several = isinstance(mesh, Sequence) and not isinstance(mesh, str)
-    if several and len(mesh) == 2:  # meshes, or vertices and faces
-        several = any(isinstance(part, str | os.PathLike | Mesh) or hasattr(part, "faces") for part in mesh)
-        several = several or np.ndim(mesh[0]) != 2
-    meshes = [as_mesh(one) for one in (mesh if several else [mesh])]
+    is_list = isinstance(mesh, Sequence) and not isinstance(mesh, str)
+    if is_list and len(mesh) == 2:  # two meshes, or the vertices and faces of one
+        is_list = any(isinstance(item, str | os.PathLike | Mesh) or hasattr(item, "faces") for item in mesh)
+        is_list = is_list or np.ndim(mesh[0]) != 2
+    meshes = [as_mesh(source) for source in (mesh if is_list else [mesh])]
     if not meshes:
         raise InputError("voxelize_mesh: expected at least one mesh")
     values = one_for_all(value, "value", len(meshes))
     require(8.5 * grid.n_voxels, "a volume of {} x {} x {} voxels".format(*grid.shape))
     array = np.zeros(grid.shape, np.float32)
-    for i, (one, inside) in enumerate(zip(meshes, values, strict=True)):
-        covered = mesh_coverage(one, grid, part_of(progress, i, len(meshes)))
-        array += covered * (np.float32(inside) - array)
+    for i, (mesh, mesh_value) in enumerate(zip(meshes, values, strict=True)):
+        coverage = mesh_coverage(mesh, grid, part_of(progress, i, len(meshes)))
+        array += coverage * (np.float32(mesh_value) - array)
     return Volume(freeze(array), grid, quantity)
 
 
 def mesh_coverage(mesh: Mesh, grid: Grid, progress: Progress | None = None) -> Floats32:
-    """Share of each voxel that lies inside a closed mesh, 0 to 1, float32 array of the grid's shape.
+    """Return the fraction of each voxel that lies inside a closed mesh, 0 to 1, a float32 array of the grid's shape.
 
-    Where the mesh intersects itself, everything that any part of it encloses is inside; there the shares are approximate,
-    their sum to about 1/10000, in long voxels to 1/1000.
+    Where the mesh intersects itself, all points that any part of it encloses are inside; there the fractions are
+    approximate, their sum to about 1/10000, in long voxels to 1/1000.
     """
     require_closed(mesh)
     coverage = np.zeros(grid.shape, np.float32)
-    # Voxel i lies between the planes i and i + 1.
+    # In these coordinates, voxel i lies between the planes i and i + 1.
     corners = (moved(grid.index_from_world, mesh.vertices) + 0.5)[mesh.faces]
     start = np.floor(corners.min(axis=(0, 1))).clip(0, grid.shape).astype(int)
     stop = np.ceil(corners.max(axis=(0, 1))).clip(0, grid.shape).astype(int)
@@ -88,14 +89,15 @@ def mesh_coverage(mesh: Mesh, grid: Grid, progress: Progress | None = None) -> F
         return coverage
     box = coverage[tuple(slice(a, b) for a, b in zip(start, stop, strict=True))]
     n_x, n_y, n_z = box.shape
-    surface = _seen(_slab(_slab(corners - start, 0, 0, n_x), 1, 0, n_y))
+    surface = _drop_vertical(_clip_between(_clip_between(corners - start, 0, 0, n_x), 1, 0, n_y))
     # A piece in front of a column covers all of the column; a piece behind it, nothing.
     in_front = _clip(surface[surface[:, :, 2].min(axis=1) < 0], 2, 0, -1)
     in_front[:, :, 2] = 0
-    surface = _seen(_joined([in_front, _slab(surface, 2, 0, n_z)]))
-    # A voxel's mean does not tell the winding numbers 0 and 2, or -1 and 1, from 1 and 0: rays through the whole box do.
-    is_mixed = _along_rays((corners - start) / [n_x, n_y, 1], (1, 1, 1), (_STEP / 32, _STEP / 32))[1].any()
-    # Rays for the shares there: their area in columns, and their distance along x, in proportion to the box if possible.
+    surface = _drop_vertical(_concatenate([in_front, _clip_between(surface, 2, 0, n_z)]))
+    # A voxel's mean cannot distinguish winding numbers 0 and 2, or -1 and 1, from 1 and 0; rays through the whole box can.
+    is_mixed = _ray_coverage((corners - start) / [n_x, n_y, 1], (1, 1, 1), (_STEP / 32, _STEP / 32))[1].any()
+    # Rays for the fractions there: the area of a column per ray, and the rays' distance along x, in proportion to the box if
+    # possible.
     area = min(n_x * n_y / _RAYS, _STEP**2)
     step = min(max(math.sqrt(area * n_x / n_y), area / _STEP), _STEP)
     thickness = max(1, min(_VOXELS // (n_y * n_z), int(_RAYS * area / n_y)))
@@ -103,161 +105,167 @@ def mesh_coverage(mesh: Mesh, grid: Grid, progress: Progress | None = None) -> F
     for first in range(0, n_x, thickness):
         last = min(first + thickness, n_x)
         n = last - first
-        pieces = _slab(surface[(low < last) & (high > first)], 0, first, last) - [first, 0, 0]
-        covered = np.abs(_winding(pieces, (n, n_y, n_z)))
-        if is_mixed or covered.max() > 1 + _ROUNDING:
-            by_rays, overlap = _along_rays(pieces, (n, n_y, n_z), (step, area / step))
-            covered[overlap] = by_rays[overlap]
-        box[first:last] = np.where(covered < _ROUNDING, 0, np.where(covered > 1 - _ROUNDING, 1, covered))
+        pieces = _clip_between(surface[(low < last) & (high > first)], 0, first, last) - [first, 0, 0]
+        fraction = np.abs(_winding_numbers(pieces, (n, n_y, n_z)))
+        if is_mixed or fraction.max() > 1 + _ROUNDING:
+            ray_fraction, overlap = _ray_coverage(pieces, (n, n_y, n_z), (step, area / step))
+            fraction[overlap] = ray_fraction[overlap]
+        box[first:last] = np.where(fraction < _ROUNDING, 0, np.where(fraction > 1 - _ROUNDING, 1, fraction))
         tell(progress, last, n_x)
     return coverage
 
 
-def _along_rays(surface: Floats, shape: tuple[int, int, int], step: tuple[float, float]) -> tuple[Floats, Bools]:
-    """The shares of voxels inside the surface of polygons (N, V, 3), from rays along z, `step` voxels apart in x and y.
+def _ray_coverage(surface: Floats, shape: tuple[int, int, int], step: tuple[float, float]) -> tuple[Floats, Bools]:
+    """Return the fraction of each voxel inside a surface of polygons (N, V, 3), and the columns with overlaps (n_x, n_y).
 
-    Also the columns of voxels (n_x, n_y) in which there are winding numbers other than 0 and 1, or 0 and -1.
+    The fractions are means over rays along z, `step` voxels apart in x and y. In a column with overlaps there are winding
+    numbers other than 0 and 1, or 0 and -1.
     """
     n_x, n_y, n_z = shape
-    # A lattice whose rows follow no axis, so that walls along the voxels are met at many different places.
+    # The lattice's rows follow no axis, so that walls along the voxels are met at many different positions.
     slope = (math.sqrt(5) - 1) / 2
-    lattice = np.array([[1, slope], [-slope, 1]]) / math.hypot(1, slope) * step  # its two steps, in voxels
+    lattice = np.array([[1, slope], [-slope, 1]]) / math.hypot(1, slope) * step  # rows: the lattice's steps, in voxels
     corners = np.array([[0, 0], [n_x, 0], [0, n_y], [n_x, n_y]]) @ np.linalg.inv(lattice)
     start = np.floor(corners.min(axis=0)).astype(np.int64)
     size = np.ceil(corners.max(axis=0)).astype(np.int64) + 1 - start
     column = np.floor((np.indices(tuple(size.tolist())).reshape(2, -1).T + start) @ lattice).astype(np.int64)
-    held = ((column >= 0) & (column < (n_x, n_y))).all(axis=1)
-    column = np.where(held, column[:, 0] * n_y + column[:, 1], 0)
-    n_rays = np.bincount(column[held], minlength=n_x * n_y).reshape(n_x, n_y, 1)
+    in_box = ((column >= 0) & (column < (n_x, n_y))).all(axis=1)
+    column = np.where(in_box, column[:, 0] * n_y + column[:, 1], 0)
+    n_rays = np.bincount(column[in_box], minlength=n_x * n_y).reshape(n_x, n_y, 1)
 
     triangles = np.concatenate([surface[:, [0, i, i + 1]] for i in range(1, surface.shape[1] - 1)])
     ray, z, side = _crossings(triangles, triangles[:, :, :2] @ np.linalg.inv(lattice) - start, size)
     order = np.lexsort((z, ray))
     ray, z, side = ray[order], z[order], side[order]
-    after = np.cumsum(side)  # the winding number, up to the sum over the rays before
+    winding = np.cumsum(side)  # the winding number beyond each crossing, plus a sum over all rays before
     _, firsts, counts = np.unique(ray, return_index=True, return_counts=True)
-    after -= np.repeat((after - side)[firsts], counts)
-    enters = (after != 0).astype(np.int64) - (after != side)  # 1 where the ray enters, -1 where it leaves
+    winding -= np.repeat((winding - side)[firsts], counts)
+    enters = (winding != 0).astype(np.int64) - (winding != side)  # 1 where the ray enters, -1 where it leaves
     voxel = np.floor(z).astype(np.int64).clip(0, n_z - 1)
-    place, own = column[ray] * (n_z + 1) + voxel, enters * (voxel + 1 - z)
-    steps = np.zeros(n_x * n_y * (n_z + 1))
-    np.add.at(steps, place, own)
-    np.add.at(steps, place + 1, enters - own)
-    covered = np.cumsum(steps.reshape(n_x, n_y, n_z + 1), axis=2)[:, :, :n_z] / n_rays
-    numbers = after * (np.diff(z, append=0) > _ROUNDING)  # not where one part ends and the next begins
+    index, change = column[ray] * (n_z + 1) + voxel, enters * (voxel + 1 - z)
+    steps = np.zeros(n_x * n_y * (n_z + 1))  # of the length inside, from each voxel to the next
+    np.add.at(steps, index, change)
+    np.add.at(steps, index + 1, enters - change)
+    fraction = np.cumsum(steps.reshape(n_x, n_y, n_z + 1), axis=2)[:, :, :n_z] / n_rays
+    winding *= np.diff(z, append=0) > _ROUNDING  # not where one part ends and the next begins
     lowest, highest = np.zeros((2, n_x * n_y), np.int64)
-    np.minimum.at(lowest, column[ray], numbers)
-    np.maximum.at(highest, column[ray], numbers)
-    return covered, (highest - lowest).reshape(n_x, n_y) > 1
+    np.minimum.at(lowest, column[ray], winding)
+    np.maximum.at(highest, column[ray], winding)
+    return fraction, (highest - lowest).reshape(n_x, n_y) > 1
 
 
-def _crossings(triangles: Floats, seen: Floats, size: Integers) -> tuple[Integers, Floats, Integers]:
-    """Where rays along z meet `triangles` (N, 3, 3): the ray's number, z, and 1 or -1 for the side of the triangle.
+def _crossings(triangles: Floats, projected: Floats, size: Integers) -> tuple[Integers, Floats, Integers]:
+    """Return the crossings (K,) of rays along z with `triangles` (N, 3, 3): number of the ray, z, and side.
 
-    The rays form a lattice of `size` (2,); `seen` (N, 3, 2) are the corners in lattice coordinates.
+    The side is 1 or -1, the sign of the triangle's projected area. The rays form a lattice of `size` (2,); `projected`
+    (N, 3, 2) are the triangles' corners in lattice coordinates.
     """
-    low = np.ceil(seen.min(axis=1)).astype(np.int64).clip(0, size)
-    extent = (np.floor(seen.max(axis=1)).astype(np.int64).clip(-1, size - 1) - low + 1).clip(0)
-    number = extent.prod(axis=1)
-    found = []
-    for some in np.split(np.arange(len(number)), np.flatnonzero(np.diff(np.cumsum(number) // _CANDIDATES)) + 1):
-        of = np.repeat(some, number[some])
-        nth = np.arange(len(of)) - np.repeat(np.cumsum(number[some]) - number[some], number[some])
-        at = low[of] + np.stack(np.divmod(nth, extent[of, 1]), axis=1)
-        a, b, c = (seen[of] - at[:, None]).transpose(1, 2, 0)
-        # Twice the areas between the ray and each side.
-        parts = np.stack([p[0] * q[1] - p[1] * q[0] for p, q in ((b, c), (c, a), (a, b))])
-        hit = (parts > 0).all(axis=0) | (parts < 0).all(axis=0)
-        parts = parts[:, hit]
-        whole = parts.sum(axis=0)
-        z = np.einsum("in,ni->n", parts, triangles[of[hit], :, 2]) / whole
-        found.append((at[hit] @ [size[1], 1], z, np.sign(whole).astype(np.int64)))
-    ray, z, side = map(np.concatenate, zip(*found, strict=True))
+    low = np.ceil(projected.min(axis=1)).astype(np.int64).clip(0, size)
+    extent = (np.floor(projected.max(axis=1)).astype(np.int64).clip(-1, size - 1) - low + 1).clip(0)
+    n_rays = extent.prod(axis=1)  # in the bounding rectangle of each triangle
+    crossings = []
+    for block in np.split(np.arange(len(n_rays)), np.flatnonzero(np.diff(np.cumsum(n_rays) // _CANDIDATES)) + 1):
+        triangle = np.repeat(block, n_rays[block])
+        number = np.arange(len(triangle)) - np.repeat(np.cumsum(n_rays[block]) - n_rays[block], n_rays[block])
+        ray = low[triangle] + np.stack(np.divmod(number, extent[triangle, 1]), axis=1)
+        a, b, c = (projected[triangle] - ray[:, None]).transpose(1, 2, 0)
+        # Twice the areas of the triangles between the ray and each side: barycentric coordinates times their sum.
+        areas = np.stack([p[0] * q[1] - p[1] * q[0] for p, q in ((b, c), (c, a), (a, b))])
+        is_hit = (areas > 0).all(axis=0) | (areas < 0).all(axis=0)
+        areas = areas[:, is_hit]
+        total = areas.sum(axis=0)
+        z = np.einsum("in,ni->n", areas, triangles[triangle[is_hit], :, 2]) / total
+        crossings.append((ray[is_hit] @ [size[1], 1], z, np.sign(total).astype(np.int64)))
+    ray, z, side = map(np.concatenate, zip(*crossings, strict=True))
     return ray, z, side
 
 
-def _winding(surface: Floats, shape: tuple[int, int, int]) -> Floats:
-    """Mean winding number of each voxel with respect to a surface of polygons (N, V, 3)."""
+def _winding_numbers(surface: Floats, shape: tuple[int, int, int]) -> Floats:
+    """Return the mean winding number of each voxel with respect to a surface of polygons (N, V, 3)."""
     n_x, n_y, n_z = shape
-    steps = np.zeros(n_x * n_y * (n_z + 1))  # in the winding number, from each voxel to the next
+    steps = np.zeros(n_x * n_y * (n_z + 1))  # of the winding number, from each voxel to the next
     for first in range(0, len(surface), _POLYGONS):
         pieces = surface[first : first + _POLYGONS]
         cells = np.zeros((len(pieces), 3), np.int64)
         for axis in range(3):
             pieces, cells = _split(pieces, cells, axis, shape[axis])
         area, moment = np.zeros(len(pieces)), np.zeros(len(pieces))
-        tip = pieces[:, 0]
+        apex = pieces[:, 0]
         for i in range(1, pieces.shape[1] - 1):  # a fan of triangles
-            left, right = pieces[:, i] - tip, pieces[:, i + 1] - tip
-            # As seen along z: positive or negative, by its side.
-            part = (left[:, 0] * right[:, 1] - left[:, 1] * right[:, 0]) / 2
-            area += part
-            moment += part * (tip[:, 2] + (left[:, 2] + right[:, 2]) / 3)
-        own = area * (cells[:, 2] + 1) - moment
+            a, b = pieces[:, i] - apex, pieces[:, i + 1] - apex
+            # Area of the projection along z, with the sign of the side to which the triangle looks.
+            triangle_area = (a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]) / 2
+            area += triangle_area
+            moment += triangle_area * (apex[:, 2] + (a[:, 2] + b[:, 2]) / 3)
+        prism = area * (cells[:, 2] + 1) - moment  # the prism's volume in the piece's own voxel
         voxel = (cells[:, 0] * n_y + cells[:, 1]) * (n_z + 1) + cells[:, 2]
-        np.add.at(steps, voxel, own)
-        np.add.at(steps, voxel + 1, area - own)
+        np.add.at(steps, voxel, prism)
+        np.add.at(steps, voxel + 1, area - prism)
     return np.cumsum(steps.reshape(n_x, n_y, n_z + 1), axis=2)[:, :, :n_z]
 
 
 def _split(pieces: Floats, cells: Integers, axis: int, n: int) -> tuple[Floats, Integers]:
-    """The `pieces` (N, V, 3) cut at the whole numbers along `axis`, and `cells` (N, 3) with their index along it."""
+    """Cut `pieces` (N, V, 3) at the whole numbers along `axis`; return the parts, and their `cells` with that index set.
+
+    `cells` (N, 3) are the voxel indices of the pieces; `n` is the number of voxels along the axis.
+    """
     low = np.floor(pieces[:, :, axis].min(axis=1)).astype(np.int64).clip(0, n - 1)
     high = np.ceil(pieces[:, :, axis].max(axis=1)).astype(np.int64).clip(low + 1, n)
     counts = high - low
-    whole, several = np.flatnonzero(counts == 1), np.flatnonzero(counts > 1)
-    of = np.repeat(several, counts[several])
-    before = np.cumsum(counts[several]) - counts[several]
-    cell = low[of] + np.arange(len(of)) - np.repeat(before, counts[several])
-    parts = _slab(pieces[of], axis, cell, cell + 1)
-    cells = cells[np.concatenate([whole, of])]
-    cells[:, axis] = np.concatenate([low[whole], cell])
-    return _joined([pieces[whole], parts]), cells
+    uncut, cut = np.flatnonzero(counts == 1), np.flatnonzero(counts > 1)
+    parent = np.repeat(cut, counts[cut])
+    first = np.cumsum(counts[cut]) - counts[cut]
+    cell = low[parent] + np.arange(len(parent)) - np.repeat(first, counts[cut])
+    parts = _clip_between(pieces[parent], axis, cell, cell + 1)
+    cells = cells[np.concatenate([uncut, parent])]
+    cells[:, axis] = np.concatenate([low[uncut], cell])
+    return _concatenate([pieces[uncut], parts]), cells
 
 
-def _joined(pieces: list[Floats]) -> Floats:
-    """Pieces with different numbers of corners in one array; the last corner is repeated."""
-    corners = max(part.shape[1] for part in pieces)
-    return np.concatenate([part[:, np.minimum(np.arange(corners), part.shape[1] - 1)] for part in pieces])
+def _concatenate(groups: list[Floats]) -> Floats:
+    """Return groups of pieces (N, V, 3) with different numbers V of corners in one array, their last corners repeated."""
+    n_corners = max(pieces.shape[1] for pieces in groups)
+    return np.concatenate([pieces[:, np.minimum(np.arange(n_corners), pieces.shape[1] - 1)] for pieces in groups])
 
 
-def _slab(pieces: Floats, axis: int, low: ArrayLike, high: ArrayLike) -> Floats:
-    """The parts of `pieces` between two planes each."""
+def _clip_between(pieces: Floats, axis: int, low: ArrayLike, high: ArrayLike) -> Floats:
+    """Return the parts of convex `pieces` (N, V, 3) between the planes at `low` and `high` along `axis`."""
     return _clip(_clip(pieces, axis, low, 1), axis, high, -1)
 
 
-def _seen(pieces: Floats) -> Floats:
-    """Those `pieces` that have an area as seen along z; the others cover nothing."""
+def _drop_vertical(pieces: Floats) -> Floats:
+    """Return the `pieces` (N, V, 3) whose projection along z has an area; others cover nothing."""
     return pieces[(np.ptp(pieces[:, :, :2], axis=1) > 0).all(axis=1)]
 
 
 def _clip(pieces: Floats, axis: int, plane: ArrayLike, side: int) -> Floats:
-    """The parts of convex `pieces` (N, V, 3) above (`side` 1) or below (-1) each one's `plane`: (N, W, 3).
+    """Return the parts (N, W, 3) of convex `pieces` (N, V, 3) above (`side` 1) or below (-1) the `plane`.
 
-    I. Sutherland, G. Hodgman, "Reentrant polygon clipping", CACM 17 (1974). Spare corners repeat the last one; a piece that
-    lies on the other side completely becomes a point.
+    `plane` is its position along `axis`, one for all pieces or one for each (N,). I. Sutherland, G. Hodgman, "Reentrant
+    polygon clipping", CACM 17 (1974). Spare corners repeat the last one; a piece that lies completely on the other side
+    becomes a point.
     """
-    n, corners = pieces.shape[:2]
+    n, n_corners = pieces.shape[:2]
     plane = np.broadcast_to(plane, n)
     depth = side * (pieces[:, :, axis] - plane[:, None])
     if not (depth < 0).any():
         return pieces
-    following = np.roll(depth, -1, axis=1)
-    crosses = (depth > 0) & (following < 0) | (depth < 0) & (following > 0)
-    of, corner = np.nonzero(crosses)
-    start, end = pieces[of, corner], pieces[of, (corner + 1) % corners]
-    share = depth[of, corner] / (depth[of, corner] - following[of, corner])
+    next_depth = np.roll(depth, -1, axis=1)
+    crosses = (depth > 0) & (next_depth < 0) | (depth < 0) & (next_depth > 0)
+    piece, corner = np.nonzero(crosses)
+    start, end = pieces[piece, corner], pieces[piece, (corner + 1) % n_corners]
+    fraction = depth[piece, corner] / (depth[piece, corner] - next_depth[piece, corner])
     points = np.stack([pieces, pieces], axis=2)  # each corner, and the crossing on the edge from it
-    points[of, corner, 1] = start + share[:, None] * (end - start)
-    points[of, corner, 1, axis] = plane[of]
-    points = points.reshape(n, 2 * corners, 3)
-    kept = np.stack([depth >= 0, crosses], axis=2).reshape(n, 2 * corners)
-    place = np.cumsum(kept, axis=1)
-    count = place[:, -1:]
+    points[piece, corner, 1] = start + fraction[:, None] * (end - start)
+    points[piece, corner, 1, axis] = plane[piece]
+    points = points.reshape(n, 2 * n_corners, 3)
+    is_kept = np.stack([depth >= 0, crosses], axis=2).reshape(n, 2 * n_corners)
+    number = np.cumsum(is_kept, axis=1)  # from 1, among the kept points of the piece
+    count = number[:, -1:]
     width = max(3, int(count.max(initial=0)))
     result = np.zeros((n, width, 3))
-    of, corner = np.nonzero(kept)
-    result[of, place[of, corner] - 1] = points[of, corner]
-    spare = np.arange(width) >= count
+    piece, corner = np.nonzero(is_kept)
+    result[piece, number[piece, corner] - 1] = points[piece, corner]
+    is_spare = np.arange(width) >= count
     last = result[np.arange(n), np.maximum(count[:, 0] - 1, 0)]
-    return np.where(spare[:, :, None], last[:, None], result)
+    return np.where(is_spare[:, :, None], last[:, None], result)

@@ -1,7 +1,5 @@
 """Laws of the pinhole's plane: the knife edge, the hole's quadrature, and what stops photons."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import itertools

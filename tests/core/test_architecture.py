@@ -1,7 +1,5 @@
 """Promises of the layout that no linter checks: one version, no stray package, nothing imported too early."""
 
-from __future__ import annotations
-
 import ast
 import functools
 import gc

@@ -1,7 +1,5 @@
 """``mphdrr backproject``: it does what Python does; line integrals of runs; what is written and refused."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Back-projections: sum, geometric mean and minimum over views, the number of views, depth distributions, the findings."""
 
-from __future__ import annotations
-
 import tracemalloc
 
 import numpy as np

@@ -15,7 +15,6 @@ import pytest
 
 import mphdrr.core as mph
 from mphdrr.core.cli import main
-from mphdrr.core.exchange import write_geometry
 from mphdrr.core.geometry.checks.plates import needed_angle
 from mphdrr.core.geometry.collimator import Collimator, Construction
 from mphdrr.core.physics.aperture import KnifeEdge
@@ -112,7 +111,7 @@ def assert_only_the_hole_is_open(through: Rays, past: Rays, cut) -> None:
 def test_every_roi_ray_passes_the_mesh_and_the_stl_file_through_the_hole_alone(scanner, tmp_path, rng, place):
     trimesh = pytest.importorskip("trimesh")
     chosen = scanner[::9]
-    write_geometry(chosen, tmp_path / "stl", "stl-parts", part="collimators", edge_at=place)
+    mph.write_geometry(chosen, tmp_path / "stl", "stl-parts", part="collimators", edge_at=place)
     parts = [p for p in chosen.parts(Construction(edge_at=place)) if p.kind == "collimator"]
     for m, part in enumerate(parts):
         read = trimesh.load(tmp_path / "stl" / f"{part.name}.stl")
@@ -224,7 +223,7 @@ def gate10_solids(folder, system) -> Solids:
 @pytest.mark.parametrize(("format", "read"), [("gate9", gate9_solids), ("gate10", gate10_solids)])
 def test_every_roi_ray_passes_the_solids_of_gate_through_the_hole_alone(scanner, tmp_path, rng, format, read, place):
     scanner = scanner[::4]
-    write_geometry(scanner, tmp_path / "gate", format, views=scanner.views((4, 4), "real"), edge_at=place)
+    mph.write_geometry(scanner, tmp_path / "gate", format, views=scanner.views((4, 4), "real"), edge_at=place)
     solids = read(tmp_path / "gate", scanner)
     assert sorted(solids) == list(range(len(scanner)))
     for m, (solid, air) in solids.items():
@@ -235,7 +234,7 @@ def test_every_roi_ray_passes_the_solids_of_gate_through_the_hole_alone(scanner,
 def test_the_path_through_the_drawn_plate_is_that_of_the_physics(scanner, tmp_path, rng):
     """Beside the rim, where a ray leaves the edge within the plate, GATE's solid attenuates it as `KnifeEdge` does."""
     mu, plate = 2.0, 6.0
-    write_geometry(
+    mph.write_geometry(
         scanner, tmp_path / "gate", "gate10", views=scanner.views((4, 4), "real"), plate_thickness=plate,
         wall_thickness=5.0, opening_degrees=80,
     )  # fmt: skip

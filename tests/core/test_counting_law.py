@@ -1,7 +1,5 @@
 """One law of counting: points, maps, projections and cameras in torch count the same, and torch differentiates it."""
 
-from __future__ import annotations
-
 import copy
 import pickle
 

@@ -1,7 +1,5 @@
 """Laws of the crystal: how much is absorbed, how deep, and at which position it is recorded."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

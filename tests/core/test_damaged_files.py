@@ -1,7 +1,5 @@
 """Damage of one bit: an error in one line, or the same content; never other numbers without a word."""
 
-from __future__ import annotations
-
 import gzip
 import json
 import warnings
@@ -18,7 +16,6 @@ import pytest
 
 import mphdrr.core as mph
 from mphdrr.core import hdf5
-from mphdrr.core.reconstruction.result import Reconstruction
 
 from .conftest import needs_torch, refused, run_python
 from .test_volume_formats import write_meta_image
@@ -42,8 +39,8 @@ def run(system, volume, rng) -> mph.ProjectionRun:
 
 
 @pytest.fixture
-def result(volume) -> Reconstruction:
-    return Reconstruction(volume, np.array([1.0, 2.5]), {"method": "mlem"}, {"previous": np.arange(7.0)})
+def result(volume) -> mph.Reconstruction:
+    return mph.Reconstruction(volume, np.array([1.0, 2.5]), {"method": "mlem"}, {"previous": np.arange(7.0)})
 
 
 def content(value: Any) -> Any:

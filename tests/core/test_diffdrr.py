@@ -3,8 +3,6 @@
 Results are compared with DiffDRR 0.6.1 if it is installed; the arguments before 0.4 with their definition.
 """
 
-from __future__ import annotations
-
 import itertools
 from dataclasses import replace
 from types import SimpleNamespace

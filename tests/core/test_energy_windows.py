@@ -1,7 +1,5 @@
 """Scatter from energy windows: the estimate's laws, and files with frames of several windows."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

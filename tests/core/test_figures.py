@@ -1,7 +1,5 @@
 """Figures that need no Blender: what they say is true, as pixels and as text, at every size."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 from xml.etree import ElementTree
@@ -17,7 +15,6 @@ from mphdrr.core.figures.kinds import KINDS
 from mphdrr.core.figures.page import Page
 from mphdrr.core.figures.subject import FigureSubject
 from mphdrr.core.figures.sums import orthogonal_sum
-from mphdrr.core.geometry.presets import c_arm_views
 from mphdrr.core.runs import letters
 from mphdrr.core.runs.resizing import resized
 
@@ -98,7 +95,7 @@ def test_the_virtual_c_arm_prints_the_modules_distances(subject, tmp_path, numbe
     system = subject.scanner[subject.scanner.numbers == number]
     page = draw("c-arm", FigureSubject(scanner=subject.scanner, modules=str(number)))
     b, l = float(system.pinhole_distance[0]), float(system.collimator_length[0])
-    off = float(np.linalg.norm(c_arm_views(system).sources[0] - system.centers[0]))
+    off = float(np.linalg.norm(mph.c_arm_views(system).sources[0] - system.centers[0]))
     where = "behind" if 5 * l > b else "in front of"
     assert {
         f"l = {l:.4g} mm", f"b = {b:.4g} mm", f"10 l = {10 * l:.4g} mm", f"5 l = {5 * l:.4g} mm",

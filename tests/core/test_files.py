@@ -1,7 +1,5 @@
 """Volumes and runs in files: round trips, damage, and nothing half-written."""
 
-from __future__ import annotations
-
 import os
 import sys
 

@@ -1,7 +1,5 @@
 """A disk that is full: one line, nothing left, and the old file as it was, whatever is written."""
 
-from __future__ import annotations
-
 import contextlib
 import gc
 import os
@@ -16,12 +14,7 @@ import pytest
 import mphdrr.core as mph
 from mphdrr.core.cli import main
 from mphdrr.core.figures.page import Page
-from mphdrr.core.phantoms.phantom import ShapePhantom
-from mphdrr.core.phantoms.shapes import Sphere
-from mphdrr.core.reconstruction.result import Reconstruction
 from mphdrr.core.runs.mosaic import write_png
-from mphdrr.core.volumes.meshes.mesh import Mesh, write_mesh
-from mphdrr.core.workbook.column_map import ColumnMap
 
 from .conftest import needs_torch, refused
 
@@ -51,9 +44,9 @@ MODULES, RNG = modules(), np.random.default_rng(3)
 VOLUME = mph.Volume(RNG.random((32, 32, 32), np.float32), mph.Grid((32, 32, 32), np.eye(4)), "activity")
 IMAGES, VIEWS = np.ones((len(MODULES), 4, 6), np.float32), MODULES.views((4, 6), "real", pitch=(7, 7))
 RUN = mph.ProjectionRun(IMAGES, MODULES, VIEWS, VOLUME)
-RECONSTRUCTION = Reconstruction(VOLUME, np.ones(3), {"method": "mlem"}, {"previous": VOLUME.array})
-MESH = Mesh(RNG.random((9000, 3)), np.arange(9000).reshape(-1, 3))
-PHANTOM = ShapePhantom(tuple(Sphere(radius=k + 1.0, activity=1.0) for k in range(2000)))
+RECONSTRUCTION = mph.Reconstruction(VOLUME, np.ones(3), {"method": "mlem"}, {"previous": VOLUME.array})
+MESH = mph.Mesh(RNG.random((9000, 3)), np.arange(9000).reshape(-1, 3))
+PHANTOM = mph.ShapePhantom(tuple(mph.Sphere(radius=k + 1.0, activity=1.0) for k in range(2000)))
 PAGE = Page(400, 300)
 PAGE.image(RNG.integers(0, 255, (150, 150, 3), np.uint8), 0, 0, 400, 300)
 
@@ -73,10 +66,10 @@ WRITERS: dict[str, Callable[[Path], object]] = {
             ("solids.glb", "glb", 120), ("cameras.npz", "opencv", 1000), ("parts", "stl-parts", 300),
             ("gate9", "gate9", 300), ("gate10", "gate10", 300))
     },
-    **{f"mesh{ending}": lambda path: write_mesh(MESH, path) for ending in (".stl", ".obj", ".ply", ".glb")},
+    **{f"mesh{ending}": lambda path: mph.write_mesh(MESH, path) for ending in (".stl", ".obj", ".ply", ".glb")},
     **{f"page{ending}": lambda path: PAGE.write(path) for ending in (".png", ".svg")},
     "mosaic.png": lambda path: write_png(np.random.default_rng(3).random((300, 300)), path),
-    "columns.toml": lambda path: ColumnMap(()).write(path, "word\n" * SIZE),
+    "columns.toml": lambda path: mph.ColumnMap(()).write(path, "word\n" * SIZE),
     "phantom.toml": lambda path: mph.write_phantom(PHANTOM, path),
     "scanner.xlsx": lambda path: mph.write_system(MODULES, path),
 }  # fmt: skip

@@ -1,7 +1,5 @@
 """Laws of generated systems, and of the parameters found for given ones."""
 
-from __future__ import annotations
-
 import itertools
 import math
 

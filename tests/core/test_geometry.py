@@ -1,7 +1,5 @@
 """Laws of systems, frames, views and grids."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

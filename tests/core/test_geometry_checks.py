@@ -1,7 +1,5 @@
 """Laws of the checks: planted faults are found with their depth, and nothing else is."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

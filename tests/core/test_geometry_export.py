@@ -1,7 +1,5 @@
 """Every format of cameras, read back by its own documentation, sees points where the views see them."""
 
-from __future__ import annotations
-
 import json
 import re
 import xml.etree.ElementTree as ET
@@ -12,7 +10,6 @@ import pytest
 import mphdrr.core as mph
 from mphdrr.core.cli import main
 from mphdrr.core.exchange import FORMATS
-from mphdrr.core.geometry.frames import euler_pose
 
 from .conftest import refused
 
@@ -185,8 +182,8 @@ def fiducials(views, rng, count=20):
 
 def general_views(rng, mirrored=False, count=15):
     """Views of any pose, with pixels of one proportion and many sizes, far off centre."""
-    poses = np.array([euler_pose(*rng.uniform(-4, 4, 3))[:3, :3] for _ in range(count)])
-    poses[0] = euler_pose(0, np.pi / 2, 0)[:3, :3]  # axes along the world's
+    poses = np.array([mph.euler_pose(*rng.uniform(-4, 4, 3))[:3, :3] for _ in range(count)])
+    poses[0] = mph.euler_pose(0, np.pi / 2, 0)[:3, :3]  # axes along the world's
     poses[1] = [[1, 0, 0], [0, 0, 1], [0, -1, 0]]  # RTK's gantry and in-plane angles are one here
     x, y, z = poses.transpose(1, 0, 2)
     size = rng.uniform(0.2, 3, (count, 1))
@@ -314,7 +311,7 @@ def test_nerf_pictures_are_named_after_their_modules(system, tmp_path):
         ("a.npz", "obj", {}, "expected one of astra, rtk"),
         ("a.txt", "astra", {}, "expected a name ending in .npz, .json"),
         ("a.npz", "astra", {"ndc": True}, "no option 'ndc', it has grid"),
-        ("a.npz", "astra", {"grid": mph.Grid((4, 4, 4), euler_pose(0.1, 0, 0))}, "along +x, +y, +z"),
+        ("a.npz", "astra", {"grid": mph.Grid((4, 4, 4), mph.euler_pose(0.1, 0, 0))}, "along +x, +y, +z"),
         ("a.npz", "astra", {"views": mph.parallel_views([0.0], (4, 4), 1.0)[:0]}, "views: expected one or more"),
         ("a.npz", "opencv", {"ndc": True}, "no option 'ndc', it has none"),
         ("none/a.npz", "opencv", {}, "no such folder"),

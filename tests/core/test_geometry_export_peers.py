@@ -1,7 +1,5 @@
 """The exported files in the programs themselves: `make test-peers` runs these tests with all of them installed."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

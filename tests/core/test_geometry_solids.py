@@ -1,7 +1,5 @@
 """Solids as files: other programs read the geometry with names, closed surfaces and the right positions."""
 
-from __future__ import annotations
-
 import json
 import zipfile
 from xml.etree import ElementTree
@@ -9,7 +7,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
-from mphdrr.core.exchange import write_geometry
+import mphdrr.core as mph
 from mphdrr.core.geometry.collimator import Construction
 
 trimesh = pytest.importorskip("trimesh")
@@ -108,7 +106,7 @@ def read_folder(path) -> dict:
 def test_parts_come_back_whole_and_in_their_place(system, tmp_path, read):
     format = {read_glb: "glb", read_folder: "stl-parts"}.get(read, "3mf")
     path = tmp_path / ("scanner" if read is read_folder else f"scanner.{format}")
-    write_geometry(system, path, format, plate_thickness=PLATE, wall_thickness=WALL, edge_at="back")
+    mph.write_geometry(system, path, format, plate_thickness=PLATE, wall_thickness=WALL, edge_at="back")
     meshes = read(path)
     expected = {part.name: part for part in system.parts(Construction(PLATE, WALL, edge_at="back"))}
     assert set(meshes) == set(expected) and len(expected) == 24
@@ -137,7 +135,7 @@ def test_parts_come_back_whole_and_in_their_place(system, tmp_path, read):
 @pytest.mark.parametrize(("part", "kinds"), [("all", 2), ("collimators", 1), ("crystals", 1)])
 def test_one_stl_file_holds_the_parts_chosen(system, tmp_path, part, kinds):
     path = tmp_path / "scanner.STL"
-    write_geometry(system, path, "stl", part=part)
+    mph.write_geometry(system, path, "stl", part=part)
     assert not path.read_bytes().startswith(b"solid")  # with "solid" at the start it would be a text file
     mesh = trimesh.load(path, file_type="stl")
     parts = [p for p in system.parts() if part == "all" or p.kind == part[:-1]]
@@ -149,7 +147,7 @@ def test_one_stl_file_holds_the_parts_chosen(system, tmp_path, part, kinds):
 
 
 def test_glb_shows_the_scanner_in_metres_and_in_colour(system, tmp_path):
-    write_geometry(system, tmp_path / "a.glb", "glb")
+    mph.write_geometry(system, tmp_path / "a.glb", "glb")
     document, _ = glb_chunks(tmp_path / "a.glb")
     assert [m["name"] for m in document["materials"]] == ["collimator", "crystal"]
     colors = [m["pbrMetallicRoughness"]["baseColorFactor"] for m in document["materials"]]

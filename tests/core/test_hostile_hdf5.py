@@ -1,7 +1,5 @@
 """HDF5 that reads other files, claims what no memory holds, or never ends; and devices and pipes for files."""
 
-from __future__ import annotations
-
 import gzip
 import os
 import sys
@@ -16,7 +14,6 @@ import pytest
 import mphdrr.core as mph
 from mphdrr.core import hdf5
 from mphdrr.core.toml import read_toml
-from mphdrr.core.volumes.meshes.mesh import read_mesh
 
 from .conftest import refused
 from .dicom_files import write_series
@@ -175,7 +172,7 @@ PLACES: dict[str, Callable[[Path], Any]] = {
     **{f"c{ending}": mph.read_counts for ending in (".npy", ".h5", ".dcm", ".mhd", ".hdr")},
     "r.hdf5": mph.read_reconstruction,
     "w.xlsx": mph.read_system,
-    "m.stl": read_mesh,
+    "m.stl": mph.read_mesh,
     "g.json": mph.read_geometry,
     "t.toml": read_toml,
     "p.toml": mph.read_phantom,

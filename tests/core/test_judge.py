@@ -1,7 +1,5 @@
 """The judge goes on where it stopped, judges fairly, and refuses what would flatter."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Runs of events at fewer counts: their recipes make their images, and know the same activity."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

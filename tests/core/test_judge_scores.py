@@ -1,7 +1,5 @@
 """Scores of the judge: right for the truth, whatever the counts, the pose and the place."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from types import SimpleNamespace

@@ -1,7 +1,5 @@
 """Intervals of the judge hold what they promise, and agree with closed forms."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

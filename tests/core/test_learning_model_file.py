@@ -1,7 +1,5 @@
 """Model files: sealed, without code, and refused where they do not fit; networks as methods of reconstruction."""
 
-from __future__ import annotations
-
 import io
 import json
 import os

@@ -1,7 +1,5 @@
 """The study's recipes are understood, and go together: what is judged is trained, on sets that are made."""
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 

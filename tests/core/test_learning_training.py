@@ -1,7 +1,5 @@
 """Trainings: what they learn from, that they go on as if they had not stopped, and that processes share them."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import os

@@ -1,7 +1,5 @@
 """Laws of the maps: the point sources' law, the projector's adjoint, and the sampling of directions."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

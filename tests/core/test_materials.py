@@ -1,7 +1,5 @@
 """Coefficients of materials: published values, absorption edges; and materials by name in the model of counts."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

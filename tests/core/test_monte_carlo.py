@@ -1,7 +1,5 @@
 """GATE 9 macros and the GATE 10 script, read back and compared with their geometry."""
 
-from __future__ import annotations
-
 import importlib.util
 import itertools
 import json
@@ -18,14 +16,14 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
-from mphdrr.core import ISOTOPES, DerenzoPhantom, PinholeSystem, euler_pose
-from mphdrr.core.exchange import FORMATS, write_geometry
+import mphdrr.core as mph
+from mphdrr.core.exchange import FORMATS
 from mphdrr.core.exchange.gate9 import MAX_LINES, angle_and_axis
 
 from .conftest import refused
 
 SHAPE = (40, 60)
-POSE = euler_pose(0.4, 0.9, -0.3, (3.0, -5.0, 8.0))
+POSE = mph.euler_pose(0.4, 0.9, -0.3, (3.0, -5.0, 8.0))
 
 # Every command that may occur, from the documentation and source of GATE 9.3; NAME is a volume, source or detector.
 COMMANDS = re.compile(
@@ -171,12 +169,12 @@ def rodrigues(angle: float, axis: np.ndarray) -> np.ndarray:
     return np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
 
 
-def export(system: PinholeSystem, path: Path, format: str, **options) -> Path:
-    write_geometry(system, path, format, views=system.views(SHAPE, "real"), **options)
+def export(system: mph.PinholeSystem, path: Path, format: str, **options) -> Path:
+    mph.write_geometry(system, path, format, views=system.views(SHAPE, "real"), **options)
     return path
 
 
-def crystal_points(system: PinholeSystem, u: float, v: float, depth: float) -> np.ndarray:
+def crystal_points(system: mph.PinholeSystem, u: float, v: float, depth: float) -> np.ndarray:
     """Return points (M, 3) of the crystals: u and v in half sides, depth in thicknesses behind the front face."""
     half, behind = system.detector_side / 2, system.collimator_length + depth * system.detector_thickness
     return system.centers + np.einsum("mij,mi->mj", system.frames(), np.stack([u * half, v * half, -behind], axis=1))
@@ -250,7 +248,7 @@ def test_macros_of_any_scanner_hang_together(system, tmp_path) -> None:
 def test_heads_on_the_axes(tmp_path) -> None:
     """With rotations by 0, 90 and 180 degrees, and on the z axis, where z × k is 0."""
     centers = 200 * np.concatenate([np.eye(3), -np.eye(3), [[0.6, 0, 0.8]]])
-    system = PinholeSystem(centers, 2.0, 60.0, 50.0, 10.0, 75.0)
+    system = mph.PinholeSystem(centers, 2.0, 60.0, 50.0, 10.0, 75.0)
     for chosen in (system, *(system[m] for m in range(len(system)))):
         head = Macros(export(chosen, tmp_path / f"{chosen.numbers}", "gate9")).volumes["SPECThead"]
         for u, v in ((0.3, 1), (-1, 0.2)):
@@ -262,19 +260,19 @@ def test_a_scanner_of_many_kinds_of_module_has_no_long_macro(tmp_path) -> None:
     n = 2 * MAX_LINES + 30
     angles = np.linspace(0, 2 * np.pi, n, endpoint=False)
     centers = np.stack([900 * np.cos(angles), 900 * np.sin(angles), np.zeros(n)], axis=1)
-    many = PinholeSystem(centers, 2.0, np.linspace(50, 60, n), np.linspace(10, 12, n), 5.0, 75.0)
+    many = mph.PinholeSystem(centers, 2.0, np.linspace(50, 60, n), np.linspace(10, 12, n), 5.0, 75.0)
     macros = Macros(export(many, tmp_path / "out", "gate9"))
     assert sum(name.startswith("collimator_") for name in macros.volumes) == n
     assert len({c for c, _ in macros.commands if c.endswith("/attachCrystalSD")}) == n
 
 
 def test_derenzo_rods_are_sources_in_their_pose(scanner, tmp_path) -> None:
-    phantom = DerenzoPhantom(45, (9, 7, 0, 5, 4, 3), 30, activity=250)
+    phantom = mph.DerenzoPhantom(45, (9, 7, 0, 5, 4, 3), 30, activity=250)
     folder = export(scanner, tmp_path / "g9", "gate9", phantom=phantom, pose=POSE, isotope="In-111")
     macros = Macros(folder)
     body = macros.volumes["phantom"]
     np.testing.assert_allclose(body.frames[0].T, POSE[:3, :3], atol=1e-12)
-    photons = sum(p for _, p in ISOTOPES["In-111"].lines)
+    photons = sum(p for _, p in mph.ISOTOPES["In-111"].lines)
     total, table = 0.0, phantom.rods()
     for sector in np.unique(table[:, 0]).astype(int):
         rods, own = macros.volumes[f"rods_{sector}"], table[table[:, 0] == sector]
@@ -298,7 +296,7 @@ def test_derenzo_rods_are_sources_in_their_pose(scanner, tmp_path) -> None:
     assert total == pytest.approx(phantom.total_activity * 1e3 * photons)
     mode, *lines = np.loadtxt(folder / "spectrum.txt")
     assert mode[0] == 1
-    np.testing.assert_allclose(np.array(lines) * [1e3, 1], ISOTOPES["In-111"].lines, rtol=1e-9)
+    np.testing.assert_allclose(np.array(lines) * [1e3, 1], mph.ISOTOPES["In-111"].lines, rtol=1e-9)
 
     folder = export(scanner, tmp_path / "g10", "gate10", phantom=phantom, pose=POSE)
     emitters = json.loads((folder / "simulation.json").read_text())["emitters"]
@@ -322,7 +320,7 @@ def test_options(scanner, tmp_path) -> None:
     assert (low, high) == pytest.approx((70.8 * 0.85, 70.8 * 1.15))
     assert not macros.values(".*/spatialResolution/.*")
     assert macros.values("/gate/source/point/gps/pos/centre") == [["1", "2", "-3", "mm"]]
-    photons = 3e6 * sum(p for _, p in ISOTOPES["Tl-201"].lines)
+    photons = 3e6 * sum(p for _, p in mph.ISOTOPES["Tl-201"].lines)
     assert float(macros.values("/gate/source/point/setActivity")[0][0]) == pytest.approx(photons)
     sizes = [float(macros.values(f"/gate/output/projection/pixelSize{k}")[0][0]) for k in "XY"]
     numbers = [int(macros.values(f"/gate/output/projection/pixelNumber{k}")[0][0]) for k in "XY"]
@@ -355,7 +353,7 @@ def test_options(scanner, tmp_path) -> None:
 )  # fmt: skip
 def test_what_cannot_be_simulated_is_refused_in_one_line(scanner, tmp_path, options, message) -> None:
     for format in ("gate9", "gate10"):
-        refused(lambda format=format: write_geometry(scanner, tmp_path / "out", format, **options), message)
+        refused(lambda format=format: mph.write_geometry(scanner, tmp_path / "out", format, **options), message)
         assert not list(tmp_path.iterdir())
 
 
@@ -476,7 +474,7 @@ def test_gate10_builds_the_scanner_in_geant4(scanner, tmp_path) -> None:
             holes.append(mother["centers"] + mother["rotations"] @ waist)
     distances = np.linalg.norm(np.concatenate(holes)[:, None] - scanner.centers, axis=2)
     assert sorted(distances.argmin(axis=1)) == list(range(len(scanner))) and distances.min(axis=1).max() < 1e-6
-    turn = euler_pose(*np.radians([20, 50, -10]))[:3, :3]
+    turn = mph.euler_pose(*np.radians([20, 50, -10]))[:3, :3]
     np.testing.assert_allclose(placed["phantom"]["rotations"], turn[None], atol=1e-12)
     assert described["sources"] == len(data["emitters"]) == sum(len(placed[f"rods_{k}"]["centers"]) for k in range(6))
 
@@ -487,7 +485,7 @@ def test_gate10_builds_the_scanner_in_geant4(scanner, tmp_path) -> None:
 
 @needs_gate10
 def test_gate10_finds_overlaps_that_are_there(tmp_path) -> None:
-    near = PinholeSystem([[200.0, 0, 0], [200.0, 30, 0]], 2.0, 60.0, 50.0, 10.0, 75.0)
+    near = mph.PinholeSystem([[200.0, 0, 0], [200.0, 30, 0]], 2.0, 60.0, 50.0, 10.0, 75.0)
     printed = run_gate10(export(near, tmp_path / "out", "gate10"), "simulation.py", "--build-only")
     assert "Overlap is detected" in printed
 
@@ -498,12 +496,12 @@ def test_gate10_chain_and_source(system, tmp_path) -> None:
     run_gate10(folder, "-c", _DRIVER)
     data, described = (json.loads((folder / f"{name}.json").read_text()) for name in ("simulation", "described"))
     # Geant4's own units: MeV and ns.
-    lines = ISOTOPES["I-123"].lines
+    lines = mph.ISOTOPES["I-123"].lines
     activity, energies, half_life, mother = described["source"]
     # In opengate 10.1.1 each of the two threads emits the full activity of its source.
     assert activity == pytest.approx(2e6 / 2 * sum(p for _, p in lines) * 1e-9)
     np.testing.assert_allclose(energies, [e * 1e-3 for e, _ in lines])
-    assert half_life == pytest.approx(ISOTOPES["I-123"].half_life * 1e9) and mother == "world"
+    assert half_life == pytest.approx(mph.ISOTOPES["I-123"].half_life * 1e9) and mother == "world"
     assert described["run"] == [5, 2, [[0, 30e9]]]
     for channel in described["channels"]:
         assert (channel["min"], channel["max"]) == pytest.approx((0.9 * 0.159, 1.1 * 0.159))
@@ -553,8 +551,8 @@ def test_the_script_asks_opengate_who_divides_the_activity(system, tmp_path, han
 
 def test_the_script_refuses_a_run_that_emitted_something_else(system, tmp_path) -> None:
     script, data = load_script(export(system, tmp_path / "out", "gate10", isotope="Tc-99m", activity=1, time=3600))
-    life = ISOTOPES["Tc-99m"].half_life / np.log(2)
-    photons = 1e6 * life * (1 - np.exp(-3600 / life)) * sum(p for _, p in ISOTOPES["Tc-99m"].lines)
+    life = mph.ISOTOPES["Tc-99m"].half_life / np.log(2)
+    photons = 1e6 * life * (1 - np.exp(-3600 / life)) * sum(p for _, p in mph.ISOTOPES["Tc-99m"].lines)
     for right in (0, 5, -5):
         script.check_emitted(data, round(photons + right * np.sqrt(photons)))
     for wrong in (photons / 2, photons * 8, photons + 10 * np.sqrt(photons)):
@@ -595,7 +593,7 @@ def test_gate10_emits_the_activity_whatever_the_number_of_threads(scanner, tmp_p
     variables = dict.fromkeys(("G4ENSDFSTATEDATA", "G4LEVELGAMMADATA"), str(tmp_path))
     run_gate10(folder, "-c", _RUN, str(threads), **variables)
     events, threads_of_photons = json.loads((folder / "emitted.json").read_text())
-    expected = 2000 * 3 * sum(p for _, p in ISOTOPES["Tc-99m"].lines)
+    expected = 2000 * 3 * sum(p for _, p in mph.ISOTOPES["Tc-99m"].lines)
     assert abs(events - expected) < 5 * np.sqrt(expected)
     numbers, each = np.unique(threads_of_photons, return_counts=True)
     assert len(numbers) == threads and each.sum() == events

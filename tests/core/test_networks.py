@@ -1,7 +1,5 @@
 """Laws of the networks of learned reconstruction, at toy sizes."""
 
-from __future__ import annotations
-
 from functools import cache
 from typing import Any
 

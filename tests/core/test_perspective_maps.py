@@ -1,7 +1,5 @@
 """Maps for networks: interpolation at the places that perspective grids say, and OSEM's volumes on its way."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

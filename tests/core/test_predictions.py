@@ -1,7 +1,5 @@
 """Each camera predicts the others: one view's image and depths against the projector's images of the other views."""
 
-from __future__ import annotations
-
 import functools
 
 import numpy as np

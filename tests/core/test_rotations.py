@@ -1,7 +1,5 @@
 """Rotations: against scipy, round trips, gradients."""
 
-from __future__ import annotations
-
 import functools
 import itertools
 

@@ -1,7 +1,5 @@
 """A column is one row of its table; a kind of scanner is its class and its columns; modules may be tilted."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
@@ -12,8 +10,6 @@ import pytest
 import mphdrr.core as mph
 from mphdrr.core.geometry.columns import Column, ColumnTable
 from mphdrr.core.geometry.scanner import SCANNERS, Scanner
-from mphdrr.core.geometry.system import PinholeSystem
-from mphdrr.core.runs.projecting import project_run
 
 from .conftest import refused
 
@@ -28,14 +24,14 @@ NEW = [
 @pytest.mark.parametrize(("column", "values"), NEW, ids=lambda value: getattr(value, "field", ""))
 def test_a_column_is_one_row(column, values, system, tmp_path, monkeypatch):
     """Its values are the scanner's, of parts of it too, and are kept in run files and in JSON."""
-    monkeypatch.setattr(PinholeSystem, "columns", PinholeSystem.columns.with_columns(column))
+    monkeypatch.setattr(mph.PinholeSystem, "columns", mph.PinholeSystem.columns.with_columns(column))
     blank = getattr(mph.PinholeSystem(system.centers, 2.0, 60.0, 50.0, 10.0, 75.0), column.field)
     assert blank.tolist() == [column.blank] * 12
     scanner = system.replace(**{column.field: values})
     assert getattr(scanner[3:5], column.field).tolist() == list(values[3:5])
     mph.write_geometry(scanner, tmp_path / "a.json", "mphdrr")
     systems = [mph.read_geometry(tmp_path / "a.json")[0]]
-    run = project_run(scanner, mph.Volume(np.ones((4, 4, 4)), mph.Grid.centered(4, 20.0), "activity"), (4, 5))
+    run = mph.project_run(scanner, mph.Volume(np.ones((4, 4, 4)), mph.Grid.centered(4, 20.0), "activity"), (4, 5))
     for name in ("run.h5", "run.npz"):
         mph.write_run(run, tmp_path / name)
         systems.append(mph.read_run(tmp_path / name).system)
@@ -195,7 +191,7 @@ def tubes(monkeypatch):
 def test_a_second_kind_is_projected_saved_and_read_back(tubes, rng, tmp_path):
     grid = mph.Grid.centered(6, 20.0)
     volume = mph.Volume(rng.uniform(0, 0.02, grid.shape), grid, "mu")
-    run = project_run(tubes, volume, (9, 11))
+    run = mph.project_run(tubes, volume, (9, 11))
     np.testing.assert_allclose(run.projections, mph.Projector(grid, tubes.views((9, 11)))(volume), rtol=1e-6)
     for name in ("run.h5", "run.npz"):
         mph.write_run(run, tmp_path / name)
@@ -214,7 +210,7 @@ def test_a_recipe_says_which_kind_of_scanner_a_workbook_is_read_as(tubes, workbo
     volume = mph.Volume(rng.uniform(0, 0.02, grid.shape), grid, "mu")
     recipe = mph.Recipe({"system.file": str(tmp_path / "both.xlsx"), "detector.rows": 9, "detector.columns": 11})
     (run,) = mph.run_recipe(recipe.updated({"system.kind": "tubes"}), volume=volume)
-    np.testing.assert_array_equal(run.projections, project_run(tubes, volume, (9, 11)).projections)
+    np.testing.assert_array_equal(run.projections, mph.project_run(tubes, volume, (9, 11)).projections)
     (pinholes,) = mph.run_recipe(recipe, volume=volume)
     assert len(pinholes.system) == 80
     unknown = recipe.updated({"system.kind": "sextant"})

@@ -1,7 +1,5 @@
 """X-ray systems: geometry, workbook, arrangements, checks, and what follows from the table of kinds of scanners."""
 
-from __future__ import annotations
-
 import math
 import warnings
 
@@ -11,7 +9,6 @@ import pytest
 import mphdrr.core as mph
 from mphdrr.core.cli import main
 from mphdrr.core.exchange import FORMATS
-from mphdrr.core.geometry.frames import euler_pose
 from mphdrr.core.xray.checks import RAYS
 from mphdrr.core.xray.system import filter_text, filter_thicknesses
 
@@ -62,7 +59,7 @@ def test_views_are_the_panels_own_pixels_or_all_of_the_panel_in_others():
 
 
 def test_sources_and_panels_move_as_rigid_bodies(arc):
-    motion = euler_pose(0.3, -0.4, 1.1, (5, -6, 7))
+    motion = mph.euler_pose(0.3, -0.4, 1.1, (5, -6, 7))
     moved = arc.at_poses(motion @ arc.poses())
     for name in ("sources", "panel_centers"):
         expected = getattr(arc, name) @ motion[:3, :3].T + motion[:3, 3]

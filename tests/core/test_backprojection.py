@@ -88,10 +88,8 @@ def test_it_is_what_the_views_say_of_each_place(rng, grid, monkeypatch, kernel, 
     views, images = odd_views(parallel), rng.random((4, 23, 26)).astype(np.float32)
     for lattice in lattices(grid, views):
         values, seen = what_views_say(images, views, centers(lattice))
-        result, count = (
-            array_of(mph.backproject(images, views, lattice, how)),
-            array_of(mph.views_that_see(views, lattice)),
-        )
+        result = array_of(mph.backproject(images, views, lattice, how))
+        count = array_of(mph.views_that_see(views, lattice))
         assert set(seen.sum(axis=0).tolist()) >= {1, 2, 3}
         assert lattice is not grid or not seen.any(axis=0).all()
         # On an image's edge float32 and float64 may see different things.

@@ -199,11 +199,8 @@ def test_report_is_json(rng):
 
 
 def test_impossible_walls_are_refused(system):
-    for walls, word in (
-        ({"plate_thickness": 0}, "plate"),
-        ({"wall_thickness": np.nan}, "wall"),
-        ({"plate_thickness": 70}, "module 1"),
-    ):
+    for wall, thickness, word in (("plate", 0, "plate"), ("wall", np.nan, "wall"), ("plate", 70, "module 1")):
+        walls = {f"{wall}_thickness": thickness}
         refused(lambda walls=walls: mph.check_geometry(system, **walls), word)
 
 

@@ -1,5 +1,7 @@
 """The coordinates (u, v, k) of views and the lattices in them."""
 
+import itertools
+
 import numpy as np
 import pytest
 
@@ -27,24 +29,15 @@ def test_round_trips_keep_world_points_pixels_and_k(scanner, rng):
             assert np.abs(grid.to_world(grid.from_world(points)) - points).max() < 1e-11
 
 
-@pytest.mark.parametrize("parallel", [False, True])
-def test_from_camera_to_camera_pixels_stay(rng, parallel):
+@pytest.mark.parametrize("kind", ["odd", "odd and parallel", "scanner"])
+def test_from_camera_to_camera_pixels_stay(scanner, rng, kind):
     points = rng.uniform(-40, 40, (500, 3))
-    pixels = mph.project_points(odd_views(parallel), points)
-    for a in grids(parallel):
-        for b in grids(parallel):
-            moved = mph.transform_points(b.matrix @ np.linalg.inv(a.matrix), a.from_world(points))
-            assert np.abs(moved[:, :2] - pixels[b.m]).max() < 1e-10
-            np.testing.assert_allclose(moved, b.from_world(a.to_world(a.from_world(points))), atol=1e-10)
-
-
-def test_from_camera_to_camera_pixels_of_the_scanner_stay(scanner, rng):
-    views, points = scanner.views((256, 240)), rng.uniform(-60, 60, (100, 3))
-    matrices, pixels = views.perspective_matrices(), mph.project_points(views, points)
-    for m in range(0, 80, 7):
-        first, back = mph.transform_points(matrices[m], points), np.linalg.inv(matrices[m])
-        for n in range(80):
-            assert np.abs(mph.transform_points(matrices[n] @ back, first)[:, :2] - pixels[n]).max() < 1e-10
+    views = scanner[::7].views((256, 240)) if kind == "scanner" else odd_views(kind != "odd")
+    pixels, lattices = mph.project_points(views, points), mph.perspective_grids(views, 7, 120.0, 330.0)
+    for a, b in itertools.product(lattices, repeat=2):
+        moved = mph.transform_points(b.matrix @ np.linalg.inv(a.matrix), a.from_world(points))
+        assert np.abs(moved[:, :2] - pixels[b.m]).max() < 1e-10
+        np.testing.assert_allclose(moved, b.from_world(a.to_world(a.from_world(points))), atol=1e-10)
 
 
 @pytest.mark.parametrize("parallel", [False, True])
@@ -100,19 +93,6 @@ def test_planes_are_evenly_spaced_in_what_they_say(parallel, uniform):
 
 
 @CASES
-def test_indices_number_the_centers(parallel, uniform):
-    for grid in grids(parallel, uniform):
-        index = np.moveaxis(np.indices(grid.shape), 0, -1)
-        p = np.concatenate([grid.centers(), np.ones((*grid.shape, 1))], axis=-1) @ grid.index_matrix.T
-        assert (p[..., 3:] > 0).all()
-        np.testing.assert_allclose(grid.index_from_world(grid.centers()), index, atol=1e-10)
-        np.testing.assert_allclose(grid.world_from_index(index), grid.centers(), atol=1e-10)
-        np.testing.assert_allclose(grid.from_world(grid.centers())[..., :2], index[..., :2], atol=1e-10)
-        depth = mph.view_frames(grid.views)[grid.m, 2] @ (grid.centers() - grid.views.sources[grid.m])[..., None]
-        np.testing.assert_allclose(depth[..., 0], np.broadcast_to(grid.depths, grid.shape), rtol=1e-12)
-
-
-@CASES
 def test_rays_have_their_whole_length_from_near_to_far(parallel, uniform):
     for grid in grids(parallel, uniform):
         n_v, n_u = grid.views.shape
@@ -146,9 +126,16 @@ def test_cell_volumes_are_integrals_of_the_jacobian(parallel, uniform):
 
 
 @CASES
-def test_indices_lead_to_the_world_and_back(parallel, uniform, rng):
+def test_indices_lead_to_the_world_and_back_and_number_the_centers(parallel, uniform, rng):
     points = rng.uniform(-60, 60, (4, 50, 3))
     for grid in grids(parallel, uniform):
+        numbers = np.moveaxis(np.indices(grid.shape), 0, -1)
+        p = np.concatenate([grid.centers(), np.ones((*grid.shape, 1))], axis=-1) @ grid.index_matrix.T
+        assert (p[..., 3:] > 0).all()
+        np.testing.assert_allclose(grid.world_from_index(numbers), grid.centers(), atol=1e-10)
+        np.testing.assert_allclose(grid.from_world(grid.centers())[..., :2], numbers[..., :2], atol=1e-10)
+        depth = mph.view_frames(grid.views)[grid.m, 2] @ (grid.centers() - grid.views.sources[grid.m])[..., None]
+        np.testing.assert_allclose(depth[..., 0], np.broadcast_to(grid.depths, grid.shape), rtol=1e-12)
         index = grid.index_from_world(points)
         assert index.shape == points.shape
         np.testing.assert_allclose(index[..., :2], grid.from_world(points)[..., :2], atol=1e-9)
@@ -156,8 +143,6 @@ def test_indices_lead_to_the_world_and_back(parallel, uniform, rng):
         between = rng.uniform(-0.5, np.array(grid.shape) - 0.5, (200, 3))
         assert np.abs(grid.index_from_world(grid.world_from_index(between)) - between).max() < 1e-9
         np.testing.assert_allclose(grid.index_from_world(points[0, 0]), index[0, 0], atol=1e-9)
-    refused(lambda: grid.index_from_world([1, 2]), "points", "3")
-    refused(lambda: grid.world_from_index([1, 2, np.nan]), "index")
 
 
 @CASES
@@ -237,4 +222,6 @@ def test_grids_that_cannot_be_are_refused():
         refused(lambda arguments=arguments: mph.PerspectiveGrid(*arguments), words)
     refused(lambda: mph.PerspectiveGrid(views, 0, 4, 1, 2).image(np.zeros((3, 3, 3))), "100 x 90 x 4", "3 x 3 x 3")
     refused(lambda: mph.perspective_grids(views, 4, [1, 2], 3), "near")
+    refused(lambda: mph.PerspectiveGrid(views, 0, 4, 1, 2).index_from_world([1, 2]), "points", "3")
+    refused(lambda: mph.PerspectiveGrid(views, 0, 4, 1, 2).world_from_index([1, 2, np.nan]), "index")
     assert mph.PerspectiveGrid(odd_views(True), -1, 4, -3, 2).m == 5

@@ -2,6 +2,7 @@
 
 import re
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -84,20 +85,20 @@ def test_pixels_that_contradict_the_detectors_side_are_warned_of_by_both_numbers
             recipe_views(mph.Recipe({f"detector.{name}": value for name, value in entries.items()}), scanner)
 
 
-@pytest.mark.parametrize("elevation", ["module", "diffdrr"])
-def test_c_arms_warn_of_pixels_that_contradict_their_detectors_side(elevation, scanner):
-    for arguments, said in (
-        (((500, 500), 2.5), "500 pixels of 2.5 mm are 1250 mm, but the side, 10 Ld, is 500 mm"),
-        (((200, 300), (1.5, 1.4), 6.0), "300 pixels of 1.5 mm are 450 mm, but the side, 6 Ld, is 300 mm"),
+def test_c_arms_warn_of_pixels_too_and_each_modules_own_side_matters(scanner):
+    one = replace(scanner, detector_side=np.where(scanner.numbers == 7, 20.0, 50.0))
+    arm, wide = partial(mph.c_arm_views, scanner), "500 pixels of 2.5 mm are 1250 mm, but the side, 10 Ld, is 500 mm"
+    for call, said in (
+        (lambda: arm((500, 500), 2.5), wide),
+        (lambda: arm((500, 500), 2.5, elevation="diffdrr"), wide),
+        (lambda: arm((200, 300), (1.5, 1.4), 6.0), "300 pixels of 1.5 mm are 450 mm, but the side, 6 Ld, is 300 mm"),
+        (
+            lambda: one.views((100, 100), "real", pitch=0.5),
+            "of 0.5 mm are 50 mm, but the real detector's side is 20 mm",
+        ),
     ):
         with pytest.warns(mph.InputWarning, match=said):
-            mph.c_arm_views(scanner, *arguments, elevation=elevation)
-
-
-def test_each_modules_own_side_matters(scanner):
-    one = replace(scanner, detector_side=np.where(scanner.numbers == 7, 20.0, 50.0))
-    with pytest.warns(mph.InputWarning, match=r"100 pixels of 0.5 mm are 50 mm, but the real detector's side is 20 mm"):
-        one.views((100, 100), "real", pitch=0.5)
+            call()
 
 
 @pytest.mark.filterwarnings("error")

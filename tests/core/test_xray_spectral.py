@@ -89,10 +89,7 @@ def test_a_panel_measures_the_energy_absorbed():
     assert m.expected([0.0], 1.0)[0] == pytest.approx(3 * 50 * stopped[0] + 4 * 90 * stopped[1])
 
 
-@pytest.mark.parametrize(
-    ("materials", "edges"),
-    [(2, (20, 60, 120)), (2, (20, 40, 60, 120)), (3, (20, 35, 60, 120))],
-)
+@pytest.mark.parametrize(("materials", "edges"), [(2, (20, 60, 120)), (2, (20, 40, 60, 120)), (3, (20, 35, 60, 120))])
 def test_the_same_model_finds_the_paths(rng, materials, edges):
     paths = np.concatenate([two_paths(rng, 500), rng.uniform(0, 0.3, (1, 500))])[:materials]
     bins = tuple(itertools.pairwise(edges))
@@ -122,10 +119,7 @@ def transmission(materials=("water", "bone"), views=None, **options):
 def test_more_materials_than_bins_and_bins_that_overlap_are_refused(rng):
     three, two_images = transmission(("water", "bone", "iodine")), rng.random((2, 3, 4))
     for call, words in (
-        (
-            lambda: mph.decompose(np.ones(2), three, 1.0),
-            "decompose: 3 materials from 2 bins: expected at least as many",
-        ),
+        (lambda: mph.decompose(np.ones(2), three, 1.0), "decompose: 3 materials from 2 bins: expected at least as"),
         (lambda: mph.decompose_images(two_images, three.materials, (45.0, 80.0)), "as many as materials, 3"),
         (lambda: transmission(bins=((20, 60), (50, 120))), "bins: bins 0 and 1 overlap"),
         (lambda: transmission(bins=((60, 20),)), "bins: bin 0: expected a lower and a higher"),

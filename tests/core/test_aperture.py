@@ -97,9 +97,8 @@ def voxel_image(n, fwhm):
     """Image on fine pixels, of a sum of 1, of a voxel of 8 mm^3 at the isocentre through n points of the hole."""
     grid, system = turned_grid((1, 1, 1), 2.0), one_module()
     views = system.views((round(SIDE / FINE),) * 2, "real", pitch=FINE)
-    image = mph.Projector(grid, views, emission(system, aperture_points=n, pixel_points=8, intrinsic_fwhm=fwhm))(
-        np.ones((1, 1, 1))
-    )
+    model = emission(system, aperture_points=n, pixel_points=8, intrinsic_fwhm=fwhm)
+    image = mph.Projector(grid, views, model)(np.ones((1, 1, 1)))
     return image[0] / image.sum()
 
 

@@ -102,10 +102,8 @@ def test_noise_below_the_background_is_none(run):
 @pytest.mark.filterwarnings("ignore::mphdrr.core.errors.InputWarning")
 def test_what_is_not_understood_is_refused_before_anything_is_written(scanner, file, tmp_path, capsys):
     output = tmp_path / "b.nii.gz"
-    for name, changes in (
-        ("other", {"model.kind": "inverse-square"}),
-        ("wide", {"detector.pitch": 4.0, "model.within_crystal": True}),
-    ):
+    wide = {"detector.pitch": 4.0, "model.within_crystal": True}
+    for name, changes in (("other", {"model.kind": "inverse-square"}), ("wide", wide)):
         mph.write_run(made(scanner, **changes), tmp_path / f"{name}.npz")
     for words, message in (
         ([tmp_path / "none.h5"], "no such file"),

@@ -67,24 +67,19 @@ def test_in_every_preset_gradients_are_the_central_differences(name, system):
 
     def counts(d, l, side, thickness):
         modules = Modules(torch.tensor(one.centers), torch.tensor(one.frames()), d, l, side, thickness)
-        at_isocentre = mph.isocentre_performance(
-            torch.tensor(one.pinhole_distance), d, l, side, thickness, optics=optics
-        )
+        distance = torch.tensor(one.pinhole_distance)
+        at_isocentre = mph.isocentre_performance(distance, d, l, side, thickness, optics=optics)
         crystal = {} if optics.crystal_mu is None else {"crystal_thickness": thickness, "crystal_side": side}
         images = emission_images(
             activity, poses[:, :3, 3], poses[:, :3, :3], l, 3.0, (9, 8), diameter=d, pixel_points=3, optics=optics,
             time=model.effective_time, backend="numpy", **crystal,
         )  # fmt: skip
-        return torch.stack(
-            [mph.sensitivity(modules, points, optics=optics).sum(), at_isocentre.sensitivity[0], images.sum()]
-        )
+        of_points = mph.sensitivity(modules, points, optics=optics).sum()
+        return torch.stack([of_points, at_isocentre.sensitivity[0], images.sum()])
 
     total = mph.Projector(grid, one.views((9, 8), "virtual", 1.0, pitch=3.0), model, "numpy")(activity).sum()
-    expected = (
-        mph.sensitivity(one, points, optics=optics).sum(),
-        mph.sensitivity(one.replace(tilt=0.0), [[0, 0, 0]], optics=optics)[0, 0],
-        total,
-    )
+    in_the_middle = mph.sensitivity(one.replace(tilt=0.0), [[0, 0, 0]], optics=optics)[0, 0]
+    expected = (mph.sensitivity(one, points, optics=optics).sum(), in_the_middle, total)
     np.testing.assert_allclose(counts(*given), expected, rtol=1e-6)
     for i in (0, 1) if optics.crystal_mu is None else (0, 1, 3):  # by d, l and Td; the side only says what is seen
         tried = [x.clone().requires_grad_(j == i) for j, x in enumerate(given)]

@@ -113,9 +113,7 @@ def test_nothing_is_cut_off_at_any_size(subject, tmp_path, kind, size):
     if min(size) < 300:
         return
     picture = page.picture
-    assert min(edge.min() for edge in (picture[0], picture[-1], picture[:, 0], picture[:, -1])) == 255, (
-        "the page's edge"
-    )
+    assert min(edge.min() for edge in (picture[0], picture[-1], picture[:, 0], picture[:, -1])) == 255
     for x, y, em, anchor, turn, text in TEXT.findall((tmp_path / "figure.svg").read_text(encoding="utf-8")):
         wide = letters.width(text, float(em))
         start = (float(y) + wide / 2) if turn else float(x) - {"start": 0, "middle": 0.5, "end": 1}[anchor] * wide

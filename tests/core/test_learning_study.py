@@ -22,9 +22,9 @@ TRAININGS = study.trainings(False) + study.trainings(True)
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    found = tmp_path_factory.mktemp("study")
-    study.scanners(found)
-    return found
+    folder = tmp_path_factory.mktemp("study")
+    study.scanners(folder)
+    return folder
 
 
 @pytest.mark.parametrize("name", study.EVENTS)

@@ -7,7 +7,6 @@ import re
 import signal
 import subprocess
 import sys
-import textwrap
 import time
 from pathlib import Path
 
@@ -269,40 +268,33 @@ if __name__ == "__main__":
 """
 
 
-def script(folder: Path) -> list[str]:
-    """The command line with the toy, as a program that Lightning can start once more."""
-    (folder / "command.py").write_text(textwrap.dedent(SCRIPT), encoding="utf-8")
-    return [sys.executable, str(folder / "command.py"), "learn", "train"]
-
-
-def environment() -> dict[str, str]:
-    return {**os.environ, "PYTHONPATH": str(Path(mphdrr.__path__[0]).parent)}
+def start_training(folder: Path, *changes: str) -> subprocess.Popen:
+    """Start a training of the toy, with one text of its recipe changed, as a program that Lightning can start again."""
+    (folder / "command.py").write_text(SCRIPT, encoding="utf-8")
+    (folder / "changed.toml").write_text(TRAINING.replace(*changes), encoding="utf-8")
+    words = ["command.py", "learn", "train", str(folder / "changed.toml"), "-o", str(folder / "m.pt")]
+    environment = {**os.environ, "PYTHONPATH": str(Path(mphdrr.__path__[0]).parent)}
+    return subprocess.Popen([sys.executable, *words], cwd=folder, env=environment, stderr=subprocess.PIPE, text=True)
 
 
 @pytest.mark.long  # each process imports torch
 def test_two_processes_have_the_loss_of_one_with_the_same_batch(recipe, tmp_path):
     one = mph.learning.train(recipe, tmp_path / "one.pt")
-    both = 'batch = 2\ndevices = 2\nstrategy = "ddp"'
-    (tmp_path / "two.toml").write_text(TRAINING.replace("batch = 2", both), encoding="utf-8")
-    done = subprocess.run(
-        [*script(tmp_path), str(tmp_path / "two.toml"), "-o", str(tmp_path / "two.pt")],
-        cwd=tmp_path, env=environment(), capture_output=True, text=True, timeout=300,
-    )  # fmt: skip
-    assert done.returncode == 0, done.stderr
-    two = mph.learning.read_model(tmp_path / "two.pt")
+    running = start_training(tmp_path, "batch = 2", 'batch = 2\ndevices = 2\nstrategy = "ddp"')
+    said = running.communicate(timeout=300)[1]
+    assert running.returncode == 0, said
+    two = mph.learning.read_model(tmp_path / "m.pt")
     for ours, theirs in zip(one.contents.curve, two.contents.curve, strict=True):
-        assert ours["train"] == pytest.approx(theirs["train"], abs=1e-4)
-        assert ours["validation"] == pytest.approx(theirs["validation"], abs=1e-4)
+        for loss in ("train", "validation"):
+            assert ours[loss] == pytest.approx(theirs[loss], abs=1e-4)
 
 
 @pytest.mark.long  # each process imports torch
 @pytest.mark.skipif(os.name == "nt", reason="Windows has no SIGINT for one process")
 def test_ctrl_c_keeps_a_checkpoint_and_the_same_command_goes_on(recipe, tmp_path):
-    (tmp_path / "long.toml").write_text(TRAINING.replace("steps = 6", "steps = 4000"), encoding="utf-8")
-    command = [*script(tmp_path), str(tmp_path / "long.toml"), "-o", str(tmp_path / "m.pt")]
     last, before = tmp_path / "m-training" / "last.ckpt", 0
     for _ in range(2):
-        running = subprocess.Popen(command, cwd=tmp_path, env=environment(), stderr=subprocess.PIPE, text=True)
+        running = start_training(tmp_path, "steps = 6", "steps = 4000")
         for _ in range(1200):
             if (last.exists() and last.stat().st_mtime_ns > before) or running.poll() is not None:
                 break

@@ -512,16 +512,6 @@ def test_gate10_chain_and_source(system, tmp_path) -> None:
         assert [links[n] for n in names] == [(crystal, None), *((crystal, n) for n in names[:-1])]
 
 
-def trial_source(handed, threads: int) -> types.SimpleNamespace:
-    """Return a source of an opengate that gives `handed(activity, threads)` to each thread; None: it has no such call."""
-    source = types.SimpleNamespace(activity=0.0)
-    if handed is not None:
-        source.initialize_g4_source = lambda listener, intervals: listener.InitializeUserInfo(
-            {"activity": handed(source.activity, threads)}
-        )
-    return source
-
-
 @pytest.mark.parametrize(
     ("handed", "share"),
     [
@@ -535,10 +525,17 @@ def test_the_script_asks_opengate_who_divides_the_activity(system, tmp_path, han
     script, _ = load_script(export(system, tmp_path / "out", "gate10"))
 
     class Simulation:
+        """The simulation of an opengate that hands `handed(activity, threads)` to each thread, or has no such call."""
+
         number_of_threads = 1
 
         def add_source(self, kind, name):
-            return trial_source(handed, self.number_of_threads)
+            source = types.SimpleNamespace(activity=0.0)
+            if handed is not None:
+                source.initialize_g4_source = lambda listener, intervals: listener.InitializeUserInfo(
+                    {"activity": handed(source.activity, self.number_of_threads)}
+                )
+            return source
 
     opengate = types.SimpleNamespace(Simulation=Simulation, __version__="11")
     assert script.activity_for_each_thread(opengate, 1) == 1

@@ -1,15 +1,10 @@
-"""A column is one row of its table; a kind of scanner is its class and its columns; modules may be tilted."""
-
-from collections.abc import Mapping
-from dataclasses import dataclass, field
-from typing import Any, ClassVar
+"""A column is one row of its table; modules may be tilted and have crystals of their own materials."""
 
 import numpy as np
 import pytest
 
 import mphdrr.core as mph
-from mphdrr.core.geometry.columns import Column, ColumnTable
-from mphdrr.core.geometry.scanner import SCANNERS, Scanner
+from mphdrr.core.geometry.columns import Column
 
 from .conftest import refused
 
@@ -137,82 +132,3 @@ def test_modules_have_the_crystals_that_they_say(system):
         refused(lambda wrong=wrong: mph.Emission(wrong, isotope="I-123"), *words)
     with pytest.warns(mph.InputWarning, match="without an isotope their photons have no energy"):
         assert mph.Emission(system.replace(crystal_material="NaI")).crystal_mu is None
-
-
-def headed(name: str, letter: str) -> dict[str, Any]:
-    return {"headings": (name, f"{name} of tube"), "place": f"Tubes!{letter}"}
-
-
-@dataclass(frozen=True, eq=False)
-class Tubes(Scanner):
-    """X-ray sources, each with a square panel that faces it."""
-
-    sheet: ClassVar[str] = "Tubes"
-    columns: ClassVar[ColumnTable] = ColumnTable(
-        [
-            *(Column(f"{axis}s", "spots", axis=i, **headed(f"{axis}s", "BCD"[i])) for i, axis in enumerate("xyz")),
-            *(Column(f"{axis}p", "panels", axis=i, **headed(f"{axis}p", "EFG"[i])) for i, axis in enumerate("xyz")),
-            Column("w", "width", plausible=(1, 1000), **headed("w", "H")),
-            Column("kVp", "voltage", kind="number", blank=120.0, **headed("kVp", "I")),
-        ]
-    )
-    spots: Any
-    panels: Any
-    width: Any
-    voltage: Any = 120.0
-    numbers: Any = None
-    source: Any = None
-    more: Mapping[str, Any] = field(default_factory=dict)
-
-    def poses(self):
-        k = (self.panels - self.spots) / np.linalg.norm(self.panels - self.spots, axis=1, keepdims=True)
-        u = np.cross([0.0, 0.0, 1.0], k)
-        u /= np.linalg.norm(u, axis=1, keepdims=True)
-        columns = np.stack([u, np.cross(k, u), k, self.spots], axis=2)
-        return np.concatenate([columns, np.broadcast_to([[[0.0, 0.0, 0.0, 1.0]]], (len(self), 1, 4))], axis=1)
-
-    def attributes_at(self, poses):
-        distance = np.linalg.norm(self.panels - self.spots, axis=1, keepdims=True)
-        return {"spots": poses[:, :3, 3], "panels": poses[:, :3, 3] + distance * poses[:, :3, 2]}
-
-    def views(self, shape=(8, 8), detector="virtual", magnification=10.0, pitch=None, offset=(0.0, 0.0)):
-        u, v, _ = self.frames().transpose(1, 0, 2)
-        steps = [axis * self.width[:, None] / n for axis, n in ((u, shape[1]), (v, shape[0]))]
-        return mph.Views(self.spots, self.panels, *steps, shape)
-
-
-@pytest.fixture
-def tubes(monkeypatch):
-    monkeypatch.setattr(Tubes, "kind", "tubes", raising=False)
-    monkeypatch.setitem(SCANNERS, "tubes", Tubes)
-    return Tubes([[400.0, 10, 0], [0, -420, 30]], [[-300.0, 0, 5], [9, 310, 0]], 250.0, numbers=[7, 9])
-
-
-def test_a_second_kind_is_projected_saved_and_read_back(tubes, rng, tmp_path):
-    grid = mph.Grid.centered(6, 20.0)
-    volume = mph.Volume(rng.uniform(0, 0.02, grid.shape), grid, "mu")
-    run = mph.project_run(tubes, volume, (9, 11))
-    np.testing.assert_allclose(run.projections, mph.Projector(grid, tubes.views((9, 11)))(volume), rtol=1e-6)
-    for name in ("run.h5", "run.npz"):
-        mph.write_run(run, tmp_path / name)
-        back = mph.read_run(tmp_path / name).system
-        assert type(back) is Tubes and back.numbers.tolist() == [7, 9] and back.voltage.tolist() == [120, 120]
-        for name in ("spots", "panels", "width"):
-            np.testing.assert_array_equal(getattr(back, name), getattr(tubes, name))
-    moved = tubes.at_poses(tubes.poses())
-    np.testing.assert_allclose(moved.panels, tubes.panels, atol=1e-12)
-    refused(lambda: mph.Emission(tubes), "emission: expected a PinholeSystem, got Tubes")
-
-
-def test_a_recipe_says_which_kind_of_scanner_a_workbook_is_read_as(tubes, workbook, rng, tmp_path):
-    mph.write_system(tubes, tmp_path / "both.xlsx", template=workbook)
-    grid = mph.Grid.centered(6, 20.0)
-    volume = mph.Volume(rng.uniform(0, 0.02, grid.shape), grid, "mu")
-    recipe = mph.Recipe({"system.file": str(tmp_path / "both.xlsx"), "detector.rows": 9, "detector.columns": 11})
-    (run,) = mph.run_recipe(recipe.updated({"system.kind": "tubes"}), volume=volume)
-    np.testing.assert_array_equal(run.projections, mph.project_run(tubes, volume, (9, 11)).projections)
-    (pinholes,) = mph.run_recipe(recipe, volume=volume)
-    assert len(pinholes.system) == 80
-    unknown = recipe.updated({"system.kind": "sextant"})
-    words = "kind of scanner 'sextant': expected one of pinhole, x-ray, tubes"
-    refused(lambda: next(mph.run_recipe(unknown, volume=volume)), words)

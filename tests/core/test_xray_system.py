@@ -212,14 +212,20 @@ def test_it_is_projected_recorded_and_read_again(both, arc, tmp_path):
     assert run.views.shape == arc.pixels == (128, 128) and run.recipe["detector.rows"] == 128
     expected = mph.Projector(grid, arc[1:4].views(), model=mph.Transmission(), backend="numpy")(volume)
     np.testing.assert_allclose(run.projections, expected, atol=1e-4 * expected.max())
-    mph.write_run(run, tmp_path / "run.h5")
-    again = mph.read_run(tmp_path / "run.h5")
-    assert_same(again.system, arc[1:4])
-    assert again.recipe["system.kind"] == "x-ray" and mph.mosaic(again.projections).ndim >= 2
+    for name in ("run.h5", "run.npz"):
+        mph.write_run(run, tmp_path / name)
+        again = mph.read_run(tmp_path / name)
+        assert_same(again.system, arc[1:4])
+        assert again.recipe["system.kind"] == "x-ray" and mph.mosaic(again.projections).ndim >= 2
     (small,) = mph.run_recipe(recipe.updated({"detector.rows": 8, "detector.columns": 16}), volume=volume)
     assert small.projections.shape == (3, 8, 16)
     emission = recipe.updated({"model.kind": "emission"})
-    refused(lambda: next(mph.run_recipe(emission, volume=volume)), "emission: expected a PinholeSystem")
+    refused(lambda: next(mph.run_recipe(emission, volume=volume)), "emission: expected a PinholeSystem, got XraySystem")
+    (pinholes,) = mph.run_recipe(recipe.updated({"system.kind": "pinhole"}), volume=volume)
+    assert mph.Recipe({})["system.kind"] == "pinhole" and type(pinholes.system) is mph.PinholeSystem
+    unknown = recipe.updated({"system.kind": "sextant"})
+    words = "kind of scanner 'sextant': expected one of pinhole, x-ray"
+    refused(lambda: next(mph.run_recipe(unknown, volume=volume)), words)
 
 
 def test_exports_hold_it_or_say_that_they_cannot(arc, tmp_path):

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import mphdrr.core as mph
+from mphdrr.core.volumes.volume import UNITS
 
 from .conftest import assert_progress, general_grid
 from .test_performance import EDGE
@@ -128,12 +129,13 @@ def test_completeness_is_one_less_the_share_of_the_gap(system, rng):
     assert volume.array.max() > 0.3
 
 
-def test_a_map_can_be_written_and_read(system, tmp_path):
-    volume = mph.modules_map(system, mph.Grid.centered(6, 20.0))
-    for name in ("a.nii.gz", "a.npz"):
+@pytest.mark.parametrize("name", ["a.nii.gz", "a.nrrd", "a.h5", "a.npz"])
+def test_volumes_of_every_quantity_are_written_and_read(tmp_path, rng, name):
+    for quantity, unit in UNITS.items():
+        volume = mph.Volume(rng.random((3, 4, 5)), mph.Grid.centered((3, 4, 5), 20.0), quantity)
         mph.write_volume(volume, tmp_path / name)
         back = mph.read_volume(tmp_path / name)
-        assert (back.quantity, back.unit) == ("modules", "1") and np.array_equal(back.array, volume.array)
+        assert (back.quantity, back.unit) == (quantity, unit) and np.array_equal(back.array, volume.array)
 
 
 def test_progress_is_told_and_can_stop(system):

@@ -60,14 +60,3 @@ def test_snapshots_are_the_volumes_of_osem(subsets):
     for volume, iterations in zip(Snapshots(A, subsets)(counts, (2, 5), 2.0), (2, 5), strict=True):
         expected = mph.osem(A, counts, iterations, subsets, background=2.0, start=even).volume.array
         assert np.abs(volume - expected).max() <= 1e-5 * expected.max()
-
-
-def test_subsets_hold_each_view_once():
-    system = mph.read_system(WORKBOOK)[::7]
-    A = mph.Projector(mph.Grid.centered((8, 8, 8), 9.0), system.views((8, 8)))
-    assert A.which.tolist() == list(range(len(system)))
-    parts = A.subsets(4)
-    assert sorted(np.concatenate([part.which for part in parts]).tolist()) == list(range(len(system)))
-    x = np.random.default_rng(0).random((8, 8, 8), np.float32)
-    for part in parts:
-        assert np.allclose(part(x), A(x)[part.which])

@@ -198,15 +198,6 @@ def test_an_edited_array_is_noticed(tmp_path, run):
     refused(lambda: mph.read_run(tmp_path / "run.npz"), "run.npz", "changed")
 
 
-def test_every_reader_of_hdf5_opens_a_sealed_file(tmp_path, run):
-    """Other programs do, too: the seal lies in the block that HDF5 leaves to users."""
-
-    mph.write_run(run, tmp_path / "run.h5")
-    with h5py.File(tmp_path / "run.h5", "r") as file:
-        assert file.userblock_size == hdf5.HEADER
-        assert np.array_equal(file["projections"][()], run.projections)
-
-
 def test_a_packed_nifti_with_something_behind_its_voxels_is_read(tmp_path, volume):
     mph.write_volume(volume, tmp_path / "v.nii")
     (tmp_path / "w.nii.gz").write_bytes(gzip.compress((tmp_path / "v.nii").read_bytes() + b"more"))

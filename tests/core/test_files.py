@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import mphdrr.core as mph
+from mphdrr.core import hdf5
 from mphdrr.core.files import replacing
 from mphdrr.core.runs.mosaic import write_png
 
@@ -82,9 +83,11 @@ def test_pt_without_torch_says_so(tmp_path, run, monkeypatch):
     assert not list(tmp_path.iterdir())
 
 
-def test_hdf5_says_units_and_conventions(tmp_path, run):
+def test_hdf5_says_units_and_conventions_and_every_reader_opens_it(tmp_path, run):
+    """The seal lies in the block that HDF5 leaves to users."""
     mph.write_run(run, tmp_path / "run.h5")
     with h5py.File(tmp_path / "run.h5") as file:
+        assert file.userblock_size == hdf5.HEADER and np.array_equal(file["projections"][()], run.projections)
         assert file["projections"].attrs["unit"] == "1/mm mm"
         assert file["geometry/collimator_length"].attrs["unit"] == "mm"
         assert "right-handed" in file.attrs["conventions"]

@@ -1,13 +1,9 @@
 """Promises of the layout that no linter checks: one version, no stray package, nothing imported too early."""
 
-from __future__ import annotations
-
 import ast
 import functools
 import gc
 import re
-import subprocess
-import sys
 import tomllib
 from pathlib import Path
 from types import UnionType
@@ -16,6 +12,8 @@ import pytest
 
 import mphdrr
 from mphdrr.core.version import VERSION
+
+from .conftest import run_python
 
 ROOT = Path(__file__).resolve().parents[2]
 PACKAGES = ("addon", "core", "operators", "panels")
@@ -63,24 +61,6 @@ def test_no_modules_import_each_other_in_a_circle():
             del imports[module]
     circles = {module: sorted(names & set(imports)) for module, names in imports.items()}
     assert circles == {}, "what is in a circle, or imports something that is"
-
-
-def test_help_imports_nothing_that_commands_work_with():
-    """Build options and help of all commands, which must be quick, also for completion."""
-    rooms = (
-        "runs.run_recipe",
-        "runs.files",
-        "workbook",
-        "design",
-        "events.event_files",
-        "learning.data",
-        "figures.scores",
-    )
-    unwanted = {f"mphdrr.core.{name}" for name in rooms} | {"bpy", "h5py", "torch", "trimesh"}
-    parsers = "from mphdrr.addon.cli import COMMANDS; from mphdrr.core.cli import build_parser; build_parser(COMMANDS)"
-    script = f"import sys; {parsers}; print(*(set({sorted(unwanted)!r}) & set(sys.modules)))"
-    loaded = subprocess.run([sys.executable, "-c", script], check=True, capture_output=True, text=True).stdout
-    assert loaded.strip() == ""
 
 
 BY_NAME = {
@@ -252,18 +232,31 @@ def test_imports_inside_the_package_are_relative():
     assert [path for path in SOURCES if absolute.search(path.read_text(encoding="utf-8"))] == []
 
 
+PARSERS = "from mphdrr.addon.cli import COMMANDS; from mphdrr.core.cli import build_parser; build_parser(COMMANDS)"
+WORKING = {
+    "workbook",
+    "design",
+    "runs.run_recipe",
+    "runs.files",
+    "events.event_files",
+    "learning.data",
+    "figures.scores",
+}
+
+
 @pytest.mark.parametrize(
-    ("module", "unwanted"),
+    ("script", "unwanted"),
     [
-        ("mphdrr", {"numpy", "bpy", "mphdrr.core", "mphdrr.addon"}),
-        ("mphdrr.core", {"bpy", "torch", "h5py", "trimesh", "PIL", "nibabel", "scipy", "openpyxl"}),
-        ("mphdrr.core.projector", {"torch"}),
+        ("import mphdrr", {"numpy", "bpy", "mphdrr.core", "mphdrr.addon"}),
+        ("import mphdrr.core", {"bpy", "torch", "h5py", "trimesh", "PIL", "nibabel", "scipy", "openpyxl"}),
+        ("import mphdrr.core.projector", {"torch"}),
+        # Options and help of all commands, so that they and completion are quick.
+        (PARSERS, {f"mphdrr.core.{name}" for name in WORKING} | {"bpy", "h5py", "torch", "trimesh"}),
     ],
 )
-def test_import_loads_nothing_heavy(module: str, unwanted: set[str]):
-    script = f"import sys, {module}; print(*(set({sorted(unwanted)!r}) & set(sys.modules)))"
-    loaded = subprocess.run([sys.executable, "-c", script], check=True, capture_output=True, text=True).stdout
-    assert loaded.strip() == ""
+def test_imports_and_help_load_nothing_heavy(script: str, unwanted: set[str]):
+    done = run_python(f"{script}\nimport sys; print(*({unwanted!r} & set(sys.modules)))")
+    assert (done.returncode, done.stdout.strip()) == (0, ""), done.stderr
 
 
 @pytest.mark.parametrize("path", [path for path in SOURCES if "bpy" in path.read_text(encoding="utf-8")], ids=str)

@@ -133,10 +133,7 @@ def test_one_undo_takes_it_back_and_runs_become_stale(scene, collection, recipe,
 
 
 def test_another_scanner_is_refused_and_stays(scene, recipe, nominal, ring_system):
-    for system, message in (
-        (nominal[:7], "has no module 71"),
-        (ring_system, "has no module 1 within"),
-    ):
+    for system, message in ((nominal[:7], "has no module 71"), (ring_system, "has no module 1 within")):
         collection = scanner.build_scanner(scene, system, "Other", replace=True)
         with pytest.raises(RuntimeError, match=f"{message}.*choose the recipe"):
             bpy.ops.mphdrr.calibrate(filepath=str(recipe))

@@ -329,14 +329,9 @@ def test_the_panel_draws_the_result(render, scene):
         getattr(layout, part).return_value = layout
     cls.draw(MagicMock(layout=layout), bpy.context)
     said = [options["text"] for _, _, options in layout.mock_calls if options.get("text")]
-    assert {
-        "OSEM, 3 iterations",
-        "Log-likelihood",
-        "NRMSE",
-        "Show Slices",
-        "Continue (+10)",
-        "Reconstruct",
-    } <= set(said)
+    assert {"OSEM, 3 iterations", "Log-likelihood", "NRMSE", "Show Slices", "Continue (+10)", "Reconstruct"} <= set(
+        said
+    )
     assert any(text.startswith("8 mm") for text in said)
     flatters = scene.mphdrr_reconstruction.details["flatters"]
     assert flatters and all(word in " ".join(said) for word in " ".join(flatters).split()), (

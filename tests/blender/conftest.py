@@ -166,15 +166,17 @@ def pixels(image: bpy.types.Image) -> np.ndarray:
 class Drawn:
     """A drawn panel: calls of its layout, the texts that it shows, and the owner of each property by name."""
 
-    def __init__(self, name: str) -> None:
+    def __init__(self, name: str, is_polled: bool = True) -> None:
         self.panel, self.layout = getattr(bpy.types, name), MagicMock()
         for kind in ("box", "column", "row", "split"):
             getattr(self.layout, kind).return_value = self.layout
-        assert not hasattr(self.panel, "poll") or self.panel.poll(bpy.context)
+        assert not is_polled or not hasattr(self.panel, "poll") or self.panel.poll(bpy.context)
         self.panel.draw(self, bpy.context)
         self.calls = self.layout.mock_calls
         self.texts = [options["text"] for _, _, options in self.calls if options.get("text")]
-        self.properties = {call.args[1].removesuffix("_unset"): call.args[0] for call in self.layout.prop.call_args_list}
+        self.properties = {
+            call.args[1].removesuffix("_unset"): call.args[0] for call in self.layout.prop.call_args_list
+        }
 
     def __getattr__(self, name: str) -> Any:
         return functools.partial(getattr(self.panel, name), self)

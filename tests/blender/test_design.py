@@ -16,6 +16,8 @@ from mphdrr.addon.scanner import collimators, following, live_scanner, module_ed
 from mphdrr.core.errors import InputError, InputWarning
 from mphdrr.core.geometry.system import PinholeSystem
 
+from .conftest import refused, reopened
+
 
 @pytest.fixture
 def roi_system(ring_system) -> PinholeSystem:
@@ -366,8 +368,7 @@ def test_duplicates_stand_along_the_ring(collection, roi_system):
     b, d, side, roi = (system.pinhole_distance, system.pinhole_diameter, system.detector_side, system.roi_radius)
     assert np.allclose(system.collimator_length, mph.collimator_length(b, d, side, roi), rtol=1e-12, atol=0)
     assert_consistent(collection)
-    with pytest.raises(RuntimeError, match="place of another module"):
-        bpy.ops.mphdrr.duplicate_modules(count=1, angle=0.0)
+    refused(bpy.ops.mphdrr.duplicate_modules, "place of another module", count=1, angle=0.0)
 
     made = module_edits.duplicate_modules(
         collection, [scanner.module(collection, 1)], 1, np.radians(30.0), follow_ring=True
@@ -391,8 +392,7 @@ def test_modules_are_removed_with_their_parts(collection):
     assert np.allclose(objects.world_matrix(marker), place, atol=1e-4)
     assert_consistent(collection)
     select(*scanner.modules(collection))
-    with pytest.raises(RuntimeError, match="at least one module"):
-        bpy.ops.mphdrr.remove_modules()
+    refused(bpy.ops.mphdrr.remove_modules, "at least one module")
 
 
 def test_check_marks_the_modules_until_something_changes(collection):
@@ -420,8 +420,7 @@ def test_files_with_shared_meshes_are_loaded(collection, tmp_path):
         for name in ("COLLIMATOR", "CRYSTAL"):
             part(camera, name).data = part(cameras_[0], name).data
     path = str(tmp_path / "old.blend")
-    bpy.ops.wm.save_as_mainfile(filepath=path)
-    bpy.ops.wm.open_mainfile(filepath=path)
+    reopened(path)
     assert_consistent(scanner.active_scanner(bpy.context.scene))
 
 
@@ -449,8 +448,7 @@ def test_collimators_of_an_older_file_get_their_knife_edge(collection, tmp_path)
     for name in ("opening_angle", "edge_at"):
         collection.mphdrr_scanner.property_unset(name)
     path = str(tmp_path / "old.blend")
-    bpy.ops.wm.save_as_mainfile(filepath=path)
-    bpy.ops.wm.open_mainfile(filepath=path)
+    reopened(path)
     loaded = scanner.active_scanner(bpy.context.scene)
     assert_consistent(loaded)
     for camera in scanner.modules(loaded):

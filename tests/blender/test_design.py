@@ -16,7 +16,7 @@ from mphdrr.addon.scanner import collimators, following, live_scanner, module_ed
 from mphdrr.core.errors import InputError, InputWarning
 from mphdrr.core.geometry.system import PinholeSystem
 
-from .conftest import refused, reopened
+from .conftest import part, refused, reopened, select, update
 
 
 @pytest.fixture
@@ -32,14 +32,6 @@ def collection(scene, roi_system):
     made = scanner.build_scanner(scene, roi_system)
     update()
     return made
-
-
-def update() -> None:
-    bpy.context.view_layer.update()
-
-
-def part(camera: bpy.types.Object, name: str) -> bpy.types.Object:
-    return next(c for c in camera.children if c.mphdrr_module.part == name)
 
 
 def depth(camera: bpy.types.Object) -> tuple[float, float]:
@@ -345,13 +337,6 @@ def test_blenders_own_duplicate_and_delete_are_tidied(collection):
     assert [len(c.children) for c in scanner.modules(collection)] == [2] * 9
     assert scanner.read_scanner(collection).numbers.tolist() == [2, 3, 4, 5, 6, 7, 8, 9, 10]
     assert_consistent(collection)
-
-
-def select(*items: bpy.types.Object) -> None:
-    bpy.ops.object.select_all(action="DESELECT")
-    for item in items:
-        item.select_set(True)
-    bpy.context.view_layer.objects.active = items[0]
 
 
 def test_duplicates_stand_along_the_ring(collection, roi_system):

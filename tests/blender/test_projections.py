@@ -194,9 +194,7 @@ RAYS = {"pixel_points", "tolerance"}
         ("INVERSE_SQUARE", "AUTO", set()),
     ],
 )
-def test_the_panels_show_the_physics_of_the_model_and_numbers_of_rays_where_rays_are_used(
-    scanned, scene, model, hole, numbers
-):
+def test_physics_and_numbers_of_rays_are_shown_where_they_are_used(scanned, scene, model, hole, numbers):
     settings = scene.mphdrr_projections
     settings.model, settings.hole, settings.photons = model, hole, 100
     assert MPHDRR_PT_physics.poll(bpy.context) == (model != "INVERSE_SQUARE")

@@ -52,13 +52,11 @@ class CountData:
         elif extra.shape not in ((), A.shape_out):
             shapes = f"one number, {A.shape_out[0]} numbers or images of {shape_text(A.shape_out)}"
             raise InputError(f"background: expected {shapes}, got {shape_text(extra.shape)}")
-        model_background = A.background.astype(np.float32)
-        if extra.any() and model_background.any():
-            means = (
-                f"{extra.mean():.3g} counts per pixel, besides {model_background.mean():.3g} of the projector's model"
-            )
+        modelled = A.background.astype(np.float32)
+        if extra.any() and modelled.any():
+            means = f"{extra.mean():.3g} counts per pixel, besides {modelled.mean():.3g} of the projector's model"
             warn(f"background: {means}: the sum is expected; leave one out if both are the same", 4)
-        data = cls(measured, extra + model_background).without_dead_pixels(A)
+        data = cls(measured, extra + modelled).without_dead_pixels(A)
         if isinstance(A.model, Emission) and len(A.views) > 3:  # two or three say too little
             _warn_if_reversed(A, A.model.system, data)
         return data

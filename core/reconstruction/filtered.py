@@ -79,9 +79,8 @@ def _warn_if_truncated(images: Array, name: str) -> None:
     largest, outermost = float(np.abs(images).max()), edges[..., :2].mean(axis=-1)
     for means in (outermost, outermost.mean(axis=1), outermost.mean(axis=(0, 1))):  # pixels, views, both edges
         edge_value = float(np.abs(means).max())
-        if edge_value > max(
-            _NEGLIGIBLE_EDGE * largest, _EDGE_DEVIATIONS * noise * np.sqrt(means.size / outermost.size / 2)
-        ):
+        noise_limit = _EDGE_DEVIATIONS * noise * np.sqrt(means.size / outermost.size / 2)
+        if edge_value > max(_NEGLIGIBLE_EDGE * largest, noise_limit):
             share = f"{edge_value / largest:.0%} of their largest value"
             effect = "the object beyond the edge is missing, and values are wrong"
             return warn(f"{name}: the images fall only to {share} at their edge columns: {effect}", 4)

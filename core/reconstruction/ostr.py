@@ -17,9 +17,7 @@ from .priors import Prior, make_penalty
 from .result import Reconstruction
 
 
-@argument(
-    "photons", float, "Photons of a pixel without any attenuation (blank scan)", "those of the run, or 1", above=0
-)
+@argument("photons", float, "Photons of a pixel without attenuation (blank scan)", "those of the run, or 1", above=0)
 def ostr(
     A: Projector,
     images: ArrayLike,
@@ -91,8 +89,8 @@ def ostr(
             measured = counts[projector.which]
             expected = blank[projector.which] * np.exp(-np.asarray(projector(x, subset_progress)))
             gradient: Array = np.asarray(projector.T(expected - measured, subset_progress)) * loop.weights
-            c = np.maximum(expected, measured)
-            curvature: Array = np.asarray(projector.T(lengths[s] * c, subset_progress)) * loop.weights
+            bounds = lengths[s] * np.maximum(expected, measured)
+            curvature: Array = np.asarray(projector.T(bounds, subset_progress)) * loop.weights
             if penalty is not None:
                 gradient = gradient - penalty.gradient(x) / n
                 curvature = curvature + 2 * penalty.curvature(x) / n

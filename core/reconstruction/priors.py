@@ -20,6 +20,9 @@ from .arguments import Choice, argument
 # Voxels of a slab of the volume: the slab's values and some arrays of the same size stay in a core's cache.
 _SLAB_VOXELS = 2**14
 
+_Derivative = Callable[[Array, Array], tuple[Any, Any]]
+"""Function of the values of pairs of voxels that returns derivatives of psi with respect to both."""
+
 
 @dataclass(frozen=True)
 class Pairs:
@@ -145,9 +148,7 @@ class Prior:
         _add_derivatives(self._second_derivatives, x, pairs, out)
 
 
-def _add_derivatives(
-    derive: Callable[[Array, Array], tuple[Any, Any]], x: Array, pairs: list[Pairs], out: Array
-) -> None:
+def _add_derivatives(derive: _Derivative, x: Array, pairs: list[Pairs], out: Array) -> None:
     """Add the weighted derivatives ``derive(a, b)`` of psi, by both voxels of each pair in the slab x, to `out`."""
     for p in pairs:
         d_first, d_second = derive(x[p.first], x[p.second])

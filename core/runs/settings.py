@@ -108,7 +108,7 @@ _DECLARED = (
     Setting("counts.frames", str, None, "Numbers of the modules in the order of the frames, such as 1-80, 80-1 or 3,1,2; "
             "none for an unused frame, none*80 for 80 of them", option="--frames",
             needs=("no counts.frames_file",)),
-    Setting("counts.frames_file", str, None, "Text file with the modules' numbers", is_path=True, needs=("no counts.frames",)),
+    Setting("counts.frames_file", str, None, "Text file with these numbers", is_path=True, needs=("no counts.frames",)),
     Setting("counts.orientation", str, None, "Orientation of a frame, as a picture with row 0 at the top, on the crystal: "
             "the side from which it is seen, front (the pinhole) or back, and the module's axis at the top; one word, or "
             "one for each frame", words=ORIENTATIONS, sizes=(), unset="Not Said"),

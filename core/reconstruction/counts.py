@@ -9,10 +9,9 @@ from ..arrays import Array, ArrayLike, Integers
 from ..errors import InputError, warn
 from ..geometry.frames import affine_matrix
 from ..geometry.grid import Grid
-from ..geometry.system import PinholeSystem
 from ..memory import require
 from ..progress import Progress
-from ..projector import Emission, Projector
+from ..projector import Projector
 from ..validation import instance, real_array, shape_text
 from .loop import Loop, numpy_if_tensor
 from .priors import Prior, make_penalty

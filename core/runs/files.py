@@ -17,7 +17,6 @@ from ..errors import InputError, needing, reading
 from ..files import AnyPath, require_ending, require_file, write_bytes
 from ..geometry.grid import Grid
 from ..geometry.scanner import Scanner
-from ..geometry.system import PinholeSystem
 from ..geometry.views import Views
 from ..hdf5 import attributes, datasets, opened, pack, read_numbers
 from ..scanner_kinds import scanner_kind
@@ -53,8 +52,7 @@ _KIND, _TEXTS = "scanner", "texts"
 def _geometry_arrays(scanner: Scanner) -> dict[str, tuple[str, Array]]:
     """Return unit and values of a scanner's arrays by name."""
     arrays = {"number": ("", scanner.numbers), "ring": ("", scanner.rings()), "pose": ("mm", scanner.poses())}
-    if isinstance(scanner, PinholeSystem):
-        arrays["pinhole_distance"] = ("mm", scanner.pinhole_distance)
+    arrays |= {name: ("mm", lengths) for name, lengths in scanner.derived_lengths().items()}
     for name, values in scanner.filled().items():
         column = scanner.columns.fields[name][0]
         if not column.is_text:

@@ -56,8 +56,8 @@ class CountData:
             means = f"{extra.mean():.3g} counts per pixel, besides {modelled.mean():.3g} of the projector's model"
             warn(f"background: {means}: the sum is expected; leave one out if both are the same", 4)
         data = cls(measured, extra + modelled).without_dead_pixels(A)
-        if isinstance(A.model, Emission) and len(A.views) > 3:  # two or three say too little
-            _warn_if_reversed(A, A.model.system, data)
+        if A.model.has_times and len(A.views) > 3:  # two or three views say too little
+            _warn_if_reversed(A, data)
         return data
 
     def without_dead_pixels(self, A: Projector) -> "CountData":
@@ -163,22 +163,17 @@ class CountLoop(Loop):
         return {"subsets": len(self.subsets), **sums} | ({"prior": None} if self.prior is None else self.prior.record())
 
 
-def _coarse_model(model: Any) -> Emission:
-    """Return a model of ideal pinholes with one ray per pixel, with the times and efficiencies of `model`."""
-    return Emission(model.system, pixel_points=1, tolerance=1e9, time=model.effective_time, efficiency=model.efficiency)
-
-
-def _warn_if_reversed(A: Projector, system: PinholeSystem, data: CountData) -> None:
+def _warn_if_reversed(A: Projector, data: CountData) -> None:
     """Warn if the counts are far likelier with the modules in reversed order.
 
     The log-likelihoods of both orders are compared after one MLEM step with at most 16 modules and 20^3 large voxels.
     """
     # The choice of modules is symmetric, so that it is the same in reversed order.
-    modules = np.unique(np.rint(np.linspace(0, len(system) - 1, min(len(system), 16))).astype(int))
+    modules = np.unique(np.rint(np.linspace(0, len(A.views) - 1, min(len(A.views), 16))).astype(int))
     shape = np.minimum(A.grid.shape, 20)
     step = A.grid.shape / shape
     grid = Grid(tuple(shape), A.grid.affine @ affine_matrix(np.diag(step), (step - 1) / 2))
-    B = Projector(grid, A.views[modules], _coarse_model(A.model.of_views(modules)), A.backend, A.threads)
+    B = Projector(grid, A.views[modules], A.model.of_views(modules).coarse(), A.backend, A.threads)
     subset, sensitivity = data[modules], np.maximum(B.T(np.ones(B.shape_out, np.float32)), NEGLIGIBLE)
     n_counts, likelihoods = float(subset.counts.sum(dtype=float)), []
     uniform = np.full(shape, n_counts / sensitivity.sum(dtype=float), np.float32)

@@ -99,17 +99,17 @@ def write_run(run: ProjectionRun, path: AnyPath) -> None:
     then stays as it is.
     """
     pack_file, _ = _FORMATS[require_ending(path, FORMATS)]
-    of_volume, of_scanner = {}, {}
+    volume_attributes, scanner_attributes = {}, {}
     if run.volume is not None:
-        of_volume = {"volume_quantity": run.volume.quantity, "volume_unit": run.volume.unit}
+        volume_attributes = {"volume_quantity": run.volume.quantity, "volume_unit": run.volume.unit}
     if run.system.kind != _PINHOLE:
-        of_scanner[_KIND] = run.system.kind
+        scanner_attributes[_KIND] = run.system.kind
     if texts := _column_texts(run.system):
-        of_scanner[_TEXTS] = json.dumps(texts)
+        scanner_attributes[_TEXTS] = json.dumps(texts)
     attributes = {
-        "format": _FORMAT, "format_version": 1 if of_volume else _FORMAT_VERSION, "conventions": _CONVENTIONS,
-        "projections_unit": run.unit, **of_volume, "seed": "none" if run.seed is None else int(run.seed),
-        "workbook": run.workbook, "workbook_sha256": run.workbook_sha256, **of_scanner,
+        "format": _FORMAT, "format_version": 1 if volume_attributes else _FORMAT_VERSION, "conventions": _CONVENTIONS,
+        "projections_unit": run.unit, **volume_attributes, "seed": "none" if run.seed is None else int(run.seed),
+        "workbook": run.workbook, "workbook_sha256": run.workbook_sha256, **scanner_attributes,
         "settings": json.dumps(dict(run.settings)), "versions": json.dumps(dict(run.versions)),
     }  # fmt: skip
     write_bytes(path, pack_file(_run_arrays(run), attributes))

@@ -15,7 +15,7 @@ import bpy
 import numpy as np
 from numpy.typing import NDArray
 
-from ...core import PinholeSystem, ProjectionRun, Views, memory
+from ...core import ProjectionRun, Views, memory
 from ...core.progress import Progress, part_of, tell
 from ...core.runs.display import Display
 from ...core.runs.exr import exr_bytes
@@ -87,9 +87,7 @@ def store_images(run: ProjectionRun, files: Pictures) -> Generator[tuple[str, in
     _store_tiles(mosaic, files.layout, numbers, run.system.rings().tolist(), run.unit, files.display)
     mosaic[_LABELS] = "\n".join(module_labels(run))
     arrays = {name: getattr(run.views, name).ravel().tolist() for name in _ARRAYS}
-    system = run.system
-    radii = system.roi_radius if isinstance(system, PinholeSystem) else np.full(len(system), system.region_radius())
-    mosaic[_VIEWS] = arrays | {"shape": run.views.shape, "roi_radius": radii.tolist()}
+    mosaic[_VIEWS] = arrays | {"shape": run.views.shape, "roi_radius": run.system.roi_radii().tolist()}
     return mosaic
 
 

@@ -254,7 +254,7 @@ class _LiveResult:
 
 
 def _scores(run: ProjectionRun, volume: Volume, progress: Progress | None) -> dict[str, Any]:
-    """The scores beside the truth as the panel shows them; none of a measured run.
+    """Return the scores beside the truth as the panel shows them; none of a measured run.
 
     They are names and values in words; of rods their size, light, valley/peak, or why there is none, and contrast.
     """

@@ -284,8 +284,8 @@ def _show_active_run() -> float | None:
     windows = bpy.context.window_manager.windows
     with bpy.context.temp_override(window=windows[0]) if windows else contextlib.nullcontext():
         scene = bpy.context.scene
-        settings, shown = scene.mphdrr_projections, runs.shown_run(scene)
-        if settings.active_run < len(settings.runs) and settings.runs[settings.active_run] != shown:
+        settings, current_run = scene.mphdrr_projections, runs.shown_run(scene)
+        if settings.active_run < len(settings.runs) and settings.runs[settings.active_run] != current_run:
             try:
                 bpy.ops.mphdrr.show_run("INVOKE_DEFAULT", index=settings.active_run)
             except RuntimeError as error:  # for example that its file is gone

@@ -53,7 +53,7 @@ def build_scanner(
         raise InputError(
             f"scanner '{name}' has changed since it was imported ({'; '.join(lost)}): set replace=True to drop the changes"
         )
-    new_scanner = NewScanner(system, system.parts(construction if isinstance(system, PinholeSystem) else None))
+    new_scanner = NewScanner(system, system.parts(construction))
     hidden_numbers: set[int] = set()
     if old is None:
         collection = bpy.data.collections.new(name)

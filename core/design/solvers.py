@@ -1,6 +1,7 @@
 """Solvers of SciPy for designs: the table of the search's algorithms, and SciPy's modules, imported on first use."""
 
 from collections.abc import Mapping
+from importlib import import_module
 from typing import Any
 
 from ..errors import needing
@@ -20,6 +21,4 @@ A second row makes the choice a setting, ``search.solver``.
 def scipy_module(name: str) -> Any:
     """Return ``scipy.<name>``, such as "optimize"; raise `InputError` if SciPy is missing."""
     with needing("mphdrr[design]"):
-        import scipy
-
-        return getattr(scipy, name)
+        return import_module(f"scipy.{name}")

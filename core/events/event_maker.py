@@ -15,7 +15,7 @@ from ..geometry.scanner import Scanner
 from ..geometry.views import Views
 from ..memory import readable_size, require
 from ..progress import Progress, tell
-from ..projector import Emission, Model, Projector
+from ..projector import Model, Projector
 from ..rays.backends import choose
 from ..recording import Remembered, recorded_warnings, remembered
 from ..runs.projecting import Imaging, warn_of_energy
@@ -155,7 +155,7 @@ class EventMaker:
             self._check_mu(planned, imaging.model)
             mu = self._voxelize(planned, "mu").array
         images = imaging.images(truth, mu)
-        if isinstance(imaging.model, Emission) and self.recipe["augmentation.module_gain"]:
+        if imaging.model.has_times and self.recipe["augmentation.module_gain"]:
             images *= gains.astype(np.float32)[:, None, None]
         return images, imaging.unit(truth)
 

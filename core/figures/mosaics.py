@@ -24,8 +24,8 @@ def _draw(page: Page, subject: FigureSubject, wide: bool) -> None:
     images = replace(subject.display, half=not wide).part(images)
     rows, columns = images.shape[1:]
     contents = "Wide FOV: whole images" if wide else "FOV: the central half of each image"
-    of_volume = f" of {subject.name}" if subject.name else ""
-    top = heading(page, f"Projections{of_volume}", [f"{contents}, {rows} × {columns} pixels"])
+    suffix = f" of {subject.name}" if subject.name else ""
+    top = heading(page, f"Projections{suffix}", [f"{contents}, {rows} × {columns} pixels"])
     window = subject.display.window(images)
     colors_width = bar_width(page, subject.display, window, run.unit)
     rings = system.rings()
@@ -64,4 +64,6 @@ def _draw(page: Page, subject: FigureSubject, wide: bool) -> None:
 
 
 draw_fov = partial(_draw, wide=False)
+"""Function that draws the central half of each projection, ``draw_fov(page, subject)``."""
 draw_wide_fov = partial(_draw, wide=True)
+"""Function that draws the whole projections, ``draw_wide_fov(page, subject)``."""

@@ -9,7 +9,7 @@ of a volume. Systems come from a workbook (`core.workbook`) or from the generato
   Workbook, column maps, ``geometry set``, panel, run files and JSON follow, and the values are an attribute of the
   system; one that the package computes with is also a field of `PinholeSystem`.
 - A kind of scanner is a class derived from `Scanner` (scanner.py) in a room of its own, and a line in
-  `core/scanner_kinds.py`; `core/xray/system.py` and `tests/blender/test_toy_scanner.py` are examples. A camera's view of
+  `core/scanner_kinds.py`; `core/xray/system.py` and `tests/blender/test_xray_scanner.py` are examples. A camera's view of
   a module is the kind's `fields`; what no scanner of a kind can have, such as two pinholes at one place, is its `faults`,
   of which reader and writer name the cell.
 - A generator is a function in generators.py that returns a `PinholeSystem`, with a line in `core/__init__.py`; its

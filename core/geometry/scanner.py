@@ -239,6 +239,14 @@ class Scanner(ABC):
         """Return the index (M,) of each module's ring, from 0; by default all modules are in one."""
         return np.zeros(len(self), dtype=np.int64)
 
+    def roi_radii(self) -> Floats:
+        """Return the radii (M,), mm, of the modules' regions of interest; by default all are `region_radius`."""
+        return np.full(len(self), self.region_radius())
+
+    def derived_lengths(self) -> Mapping[str, Floats]:
+        """Return lengths (M,), mm, by name that files hold besides the columns, from which they follow; by default none."""
+        return {}
+
     def region_radius(self) -> float:
         """Return the radius, mm, of the imaged sphere around the isocentre; by default half of the least source distance."""
         return float(np.linalg.norm(self.poses()[:, :3, 3], axis=1).min()) / 2

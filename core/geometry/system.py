@@ -175,6 +175,14 @@ class PinholeSystem(Scanner):
         """Return the largest of the modules' ROI radii, mm."""
         return float(self.roi_radius.max())
 
+    def roi_radii(self) -> Floats:
+        """Return the radii (M,), mm, of the modules' regions of interest."""
+        return self.roi_radius
+
+    def derived_lengths(self) -> dict[str, Floats]:
+        """Return the pinhole distances b (M,), mm, by name, for files."""
+        return {"pinhole_distance": self.pinhole_distance}
+
     def rings(self) -> Integers:
         """Return the index (M,) of each module's ring, from 0 along +z; pinholes at about the same z form a ring."""
         return rings_along_z(self.centers[:, 2], _RING_GAP * self.detector_side)

@@ -1,7 +1,7 @@
-"""Recipes: the settings of a piece of work, their values, and the TOML files that hold them.
+"""Recipes: the settings of a job, their values, and the TOML files that hold them.
 
-The rooms above declare their recipes with it: `runs` those of projections, `events` those of event sets, `learning` those of
-trainings and of the judge, `design` those of designs and calibrations.
+Higher layers declare their recipes with this package: `runs` the recipe of projections, `events` that of event sets,
+`learning` those of training and of the judge, `design` those of designs and calibrations.
 
 - `settings.Setting` declares one setting: its key, type, default, limits, words and texts.
 - `values.Values` holds the checked values of settings; a recipe is a class derived from it.

@@ -12,7 +12,7 @@ from ..errors import InputError
 from ..validation import real_array
 
 Words = Mapping[str, tuple[str, str]]
-"""The words that a setting allows, each with its label and its description."""
+"""Words that a setting allows, each with its label and its description."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -80,7 +80,7 @@ class Setting:
 
     @property
     def help(self) -> str:
-        """The description with unit, words and the consequence of leaving the setting out."""
+        """Description with unit, words and the consequence of leaving the setting out."""
         words = f"one of {', '.join(self.words)}" if self.words else ""
         text = ", ".join(filter(None, (self.text, self.unit, words)))
         return text + (f"; without it, {self.absent}" if self.absent else "")
@@ -164,7 +164,7 @@ class LibraryAlgorithm(NamedTuple):
     label: str
     """Name in menus."""
     text: str
-    """Line of help."""
+    """Help text of one line."""
     name: str
     """Name of the algorithm in the library."""
     options: Mapping[str, float]

@@ -24,11 +24,12 @@ class Values(ABC):
     """
 
     given: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    """Given values by the settings' keys; all other settings have their defaults."""
 
     @property
     @abstractmethod
     def rows(self) -> Mapping[str, Setting]:
-        """The declared settings by their keys."""
+        """Declared settings by their keys."""
 
     def __post_init__(self) -> None:
         rows = self.rows
@@ -69,10 +70,10 @@ class Values(ABC):
 def _expected_keys(key: str, rows: Mapping[str, Setting]) -> str:
     """Return the part of a message that says which settings there are in the table of an unknown `key`."""
     table = key.rpartition(".")[0]
-    names = [other.rpartition(".")[2] for other in rows if other.rpartition(".")[0] == table]
+    names = [row_key.rpartition(".")[2] for row_key in rows if row_key.rpartition(".")[0] == table]
     if names:
         return f"no such setting; expected {', '.join(names)}"
-    return f"expected TABLE.NAME with a table of {', '.join(dict.fromkeys(other.partition('.')[0] for other in rows))}"
+    return f"expected TABLE.NAME with a table of {', '.join(dict.fromkeys(row.partition('.')[0] for row in rows))}"
 
 
 def is_met(values: Mapping[str, Any], need: str, rows: Mapping[str, Setting]) -> bool:

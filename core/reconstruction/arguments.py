@@ -1,4 +1,4 @@
-"""Arguments of methods and priors: which of them are settings of recipes, declared beside the function that takes them."""
+"""Arguments of methods and priors that are settings of recipes, declared beside the function that takes them."""
 
 import inspect
 from collections.abc import Callable, Collection, Mapping
@@ -11,11 +11,11 @@ from ..recipes.settings import Setting
 _Taker = TypeVar("_Taker", bound=Callable[..., Any])
 
 ARGUMENTS: dict[str, Setting] = {}
-"""Settings of arguments by the argument's name, without defaults, which are those of the functions."""
+"""Settings by the argument's name, without defaults; these come from the functions' signatures."""
 
 
 def argument(name: str, kind: type, text: str, absent: str = "", **limits: Any) -> Callable[[_Taker], _Taker]:
-    """Declare the setting ``reconstruction.<name>`` of an argument; a decorator of the method or prior that takes it.
+    """Declare the setting ``reconstruction.<name>`` of an argument, as a decorator of the method or prior that takes it.
 
     All methods and priors with an argument of this name share the setting, so it is declared once. `kind`, `text`, `absent`
     and `limits` are those of `Setting`.
@@ -26,22 +26,23 @@ def argument(name: str, kind: type, text: str, absent: str = "", **limits: Any) 
 
 @dataclass(frozen=True)
 class Choice:
-    """One of several functions or classes that a setting chooses among, and whose arguments are settings, too."""
+    """Function or class that a setting chooses by name; its arguments are settings, too."""
 
     label: str
     """Name in menus."""
     text: str
-    """Line of help."""
+    """Help text of one line."""
     function: Callable[..., Any]
+    """Function or class itself."""
 
     first: ClassVar[int] = 0
     """Index of the first argument that is a setting."""
     common: ClassVar[Collection[str]] = ()
-    """Names of arguments that are no settings of their own, because all choices take them."""
+    """Names of arguments that all choices take, and that therefore are not settings of a single choice."""
 
     @cached_property
     def own(self) -> Mapping[str, Any]:
-        """The defaults of the arguments by their names; `inspect.Parameter.empty` of one that must be given."""
+        """Defaults of the choice's arguments by name; `inspect.Parameter.empty` for a required argument."""
         arguments = list(inspect.signature(self.function).parameters.values())[self.first :]
         return {
             argument.name: argument.default

@@ -50,20 +50,20 @@ class Method(Choice):
 
 
 METHODS: Mapping[str, Method] = {
-    "osem": Method("OSEM", "Likeliest activity, by subsets of the modules (fast)", osem),
-    "mlem": Method("MLEM", "Likeliest activity, by all modules at once (slow, and the likelihood never falls)", mlem),
-    "bsrem": Method("BSREM", "Likeliest activity, less the penalty of a prior: the very maximum", bsrem),
-    "sirt": Method("SIRT", "Least squares of line integrals, steadily", sirt, False, "squared error"),
+    "osem": Method("OSEM", "Maximum likelihood of activity, by subsets of the modules (fast)", osem),
+    "mlem": Method("MLEM", "Maximum likelihood of activity, with all modules at once (slow, likelihood never falls)", mlem),
+    "bsrem": Method("BSREM", "Maximum of likelihood and prior for activity, converges to the maximum", bsrem),
+    "sirt": Method("SIRT", "Least squares of line integrals, slow and robust", sirt, False, "squared error"),
     "cgls": Method("CGLS", "Least squares of line integrals, fast; values may be negative", cgls, False, "squared error"),
-    "tv": Method("TV", "Areas of one value with sharp edges, from line integrals", tv, False,
+    "tv": Method("TV", "Least squares of line integrals with uniform areas and sharp edges", tv, False,
                  "squared error with variation"),
-    "ostr": Method("OSTR", "Likeliest attenuation of photons that pass, less the penalty of a prior", ostr, False),
+    "ostr": Method("OSTR", "Maximum of likelihood and prior for attenuation, from transmitted photons", ostr, False),
 }  # fmt: skip
-"""The methods by their names in recipes and on the command line."""
+"""Methods by their names in recipes and on the command line."""
 
 
 def method_of(name: str) -> Method:
-    """Return the method of that name, or the one in the file of that name; raise `InputError` if the file holds none."""
+    """Return the method with this name in `METHODS`, or read it from the file `name`; raise `InputError` otherwise."""
     if name in METHODS:
         return METHODS[name]
     with naming(name):
@@ -73,8 +73,8 @@ def method_of(name: str) -> Method:
 def argument_settings(order: Iterable[str]) -> dict[str, Setting]:
     """Return the settings of the declared arguments by the arguments' names: those in `order`, then the others.
 
-    A setting has an effect where the chosen prior or method takes the argument. If the defaults differ among these, the
-    setting has none, and its help lists them.
+    A setting has an effect if the chosen prior or method takes the argument. If priors and methods differ in the argument's
+    default, the setting has no default, and its help lists theirs.
     """
     settings = {}
     for name in dict.fromkeys((*order, *ARGUMENTS)):

@@ -1,6 +1,5 @@
 """Back-projections of a run's images, for ``mphdrr backproject`` and Blender's panel."""
 
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -11,7 +10,6 @@ from ..geometry.grid import Grid
 from ..models.model import with_image_axes
 from ..perspective.backprojection import HOW, backproject
 from ..progress import Stages
-from ..projector import Emission
 from ..validation import instance, one_of
 from ..volumes.volume import Volume
 from .recipe import Recipe
@@ -113,10 +111,7 @@ def run_line_integrals(run: ProjectionRun) -> Floats32:
 def _pixel_weights(run: ProjectionRun) -> Floats:
     """Return the pixel weights (M, n_v, n_u): expected counts per unit line integral through the hole's centre."""
     model: Any = recipe_model(run.recipe, run.system, run=run)
-    assert isinstance(model, Emission)
-    point_model = replace(
-        model, hole="point", aperture_points=None, aperture_tolerance=None, pixel_points=1, depth_layers=1
-    )
+    point_model = model.without_blur()
     any_grid = Grid.centered((1, 1, 1), 1.0)  # the weights do not depend on the grid
     every = slice(None)  # every layer, row and column
     return with_image_axes(model.efficiency) * np.array([

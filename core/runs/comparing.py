@@ -28,7 +28,7 @@ class Difference:
 
     @property
     def text(self) -> str:
-        """The numbers in one line."""
+        """Maximum, RMS and relative difference in one line."""
         return f"maximum {self.maximum:.4g}, rms {self.rms:.4g} {self.unit}, relative {self.relative:.3%}"
 
 
@@ -44,10 +44,8 @@ def difference(run: ProjectionRun, other: ProjectionRun) -> Difference:
     if not np.array_equal(run.system.numbers, other.system.numbers):
         raise InputError("cannot compare runs of different modules: their numbers differ")
     differences = run.projections.astype(np.float64) - other.projections
-    rms, rms_of_other = (
-        float(np.sqrt(np.mean(np.square(x, dtype=np.float64)))) for x in (differences, other.projections)
-    )
-    relative = rms / rms_of_other if rms_of_other else (np.inf if rms else 0.0)
+    rms, other_rms = (float(np.sqrt(np.mean(np.square(x, dtype=np.float64)))) for x in (differences, other.projections))
+    relative = rms / other_rms if other_rms else (np.inf if rms else 0.0)
     return Difference(differences.astype(np.float32), run.unit, float(np.abs(differences).max()), rms, relative)
 
 

@@ -17,7 +17,7 @@ from ..volumes.formats import numpy_files
 from .recipe import Recipe
 
 EFFICIENCY = "efficiency"
-"""Name of the array in .npz and .h5 files that hold several."""
+"""Name of the array of efficiencies in .npz and .h5 files with several arrays."""
 
 
 def read_efficiency(path: AnyPath) -> Array:

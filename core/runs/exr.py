@@ -42,7 +42,7 @@ def exr_bytes(picture: ArrayLike) -> bytes:
 def _packed(data: bytes) -> bytes:
     """Return a block compressed by the format's ZIP: differences of the even, then the odd bytes; unchanged if shorter."""
     octets = np.frombuffer(data, np.uint8)
-    sorted_ = np.concatenate([octets[0::2], octets[1::2]])
-    sorted_[1:] = np.diff(sorted_) + np.uint8(128)
-    packed = zlib.compress(sorted_.tobytes(), 1)
+    reordered = np.concatenate([octets[0::2], octets[1::2]])
+    reordered[1:] = np.diff(reordered) + np.uint8(128)
+    packed = zlib.compress(reordered.tobytes(), 1)
     return packed if len(packed) < len(data) else data

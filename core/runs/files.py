@@ -17,7 +17,6 @@ from ..errors import InputError, needing, reading
 from ..files import AnyPath, require_ending, require_file, write_bytes
 from ..geometry.grid import Grid
 from ..geometry.scanner import Scanner
-from ..geometry.system import PinholeSystem
 from ..geometry.views import Views
 from ..hdf5 import attributes, datasets, opened, pack, read_numbers
 from ..scanner_kinds import scanner_kind
@@ -53,8 +52,7 @@ _KIND, _TEXTS = "scanner", "texts"
 def _geometry_arrays(scanner: Scanner) -> dict[str, tuple[str, Array]]:
     """Return unit and values of a scanner's arrays by name."""
     arrays = {"number": ("", scanner.numbers), "ring": ("", scanner.rings()), "pose": ("mm", scanner.poses())}
-    if isinstance(scanner, PinholeSystem):
-        arrays["pinhole_distance"] = ("mm", scanner.pinhole_distance)
+    arrays |= {name: ("mm", lengths) for name, lengths in scanner.derived_lengths().items()}
     for name, values in scanner.filled().items():
         column = scanner.columns.fields[name][0]
         if not column.is_text:
@@ -101,17 +99,17 @@ def write_run(run: ProjectionRun, path: AnyPath) -> None:
     then stays as it is.
     """
     pack_file, _ = _FORMATS[require_ending(path, FORMATS)]
-    of_volume, of_scanner = {}, {}
+    volume_attributes, scanner_attributes = {}, {}
     if run.volume is not None:
-        of_volume = {"volume_quantity": run.volume.quantity, "volume_unit": run.volume.unit}
+        volume_attributes = {"volume_quantity": run.volume.quantity, "volume_unit": run.volume.unit}
     if run.system.kind != _PINHOLE:
-        of_scanner[_KIND] = run.system.kind
+        scanner_attributes[_KIND] = run.system.kind
     if texts := _column_texts(run.system):
-        of_scanner[_TEXTS] = json.dumps(texts)
+        scanner_attributes[_TEXTS] = json.dumps(texts)
     attributes = {
-        "format": _FORMAT, "format_version": 1 if of_volume else _FORMAT_VERSION, "conventions": _CONVENTIONS,
-        "projections_unit": run.unit, **of_volume, "seed": "none" if run.seed is None else int(run.seed),
-        "workbook": run.workbook, "workbook_sha256": run.workbook_sha256, **of_scanner,
+        "format": _FORMAT, "format_version": 1 if volume_attributes else _FORMAT_VERSION, "conventions": _CONVENTIONS,
+        "projections_unit": run.unit, **volume_attributes, "seed": "none" if run.seed is None else int(run.seed),
+        "workbook": run.workbook, "workbook_sha256": run.workbook_sha256, **scanner_attributes,
         "settings": json.dumps(dict(run.settings)), "versions": json.dumps(dict(run.versions)),
     }  # fmt: skip
     write_bytes(path, pack_file(_run_arrays(run), attributes))

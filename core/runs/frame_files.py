@@ -63,9 +63,9 @@ class Counts(np.ndarray[Any, Any]):
     def __array_wrap__(self, array: Array, *_: Any) -> Any:  # type: ignore[override]
         return np.asarray(array)[()]
 
-    def exposures(self, which: Any = slice(None)) -> list[float]:
-        """Return the different exposures, s, that the files state for the frames `which`."""
-        return [time for time in np.unique(self.about[which, 0]).tolist() if math.isfinite(time)]
+    def exposures(self, frames: Any = slice(None)) -> list[float]:
+        """Return the different exposures, s, that the files state for these frames; `frames` is an index."""
+        return [time for time in np.unique(self.about[frames, 0]).tolist() if math.isfinite(time)]
 
 
 @dataclass(frozen=True)
@@ -73,9 +73,13 @@ class CountsLayout:
     """Description of a file's contents by the user, with the arguments of `read_counts`."""
 
     dataset: str | None = None
+    """Name of the array in a file with several arrays."""
     shape: tuple[int, int, int] | None = None
+    """Frames, rows and columns of a raw file."""
     type: str | None = None
+    """Type of the numbers in a raw file, one of `RAW_TYPES`."""
     big_endian: bool = False
+    """Whether the most significant byte of a raw file's numbers comes first."""
 
     @property
     def is_raw(self) -> bool:
@@ -282,16 +286,16 @@ def _read_interfile(path: Path, layout: CountsLayout) -> Counts:
     count = int(number("total number of images", (data.stat().st_size - skip) // frame if frame else 0))
     keys = (f"{name} (sec)" for name in ("time per projection", "image duration", "study duration"))
     times = next((list(map(float, header[key])) for key in keys if any(header.get(key, ()))), [])
-    starts = [float(each) for each in header.get("image relative start time (sec)", ()) if each]
-    starts = starts or [_seconds_of_day(each) for each in header.get("image start time", ()) if each]
+    starts = [float(start) for start in header.get("image relative start time (sec)", ()) if start]
+    starts = starts or [_seconds_of_day(start) for start in header.get("image start time", ()) if start]
     windows = int(number("number of energy windows", 1))
     pixel = [float(text(f"scaling factor (mm/pixel) [{i}]", "nan")) for i in (1, 2)]
     kind = f"{windows} energy windows" if windows > 1 else ""
     frames = _file_numbers(data, type_, (count, rows, columns), skip)
-    of_windows: Any = {"window": range(1, windows + 1)}
+    limits: Any = {"window": range(1, windows + 1)}
     for name, word in (("low", "lower"), ("high", "upper")):
-        of_windows[name] = [float(text(f"energy window {word} level [{i}]", "nan")) for i in of_windows["window"]]
-    return _checked_frames(frames, kind, time=times, pixel=pixel, start=starts, **of_windows)
+        limits[name] = [float(text(f"energy window {word} level [{i}]", "nan")) for i in limits["window"]]
+    return _checked_frames(frames, kind, time=times, pixel=pixel, start=starts, **limits)
 
 
 def _seconds_of_day(text: str) -> float:
@@ -389,12 +393,12 @@ def _frame_starts(data: Any, count: int) -> list[float]:
         phase_end = phase_starts[-1] + int(phase.get("NumberOfFramesInPhase") or 1) * frame_steps[-1] - pause
     slices = data.get("TimeSliceVector")
     numbers = [1] * count if slices is None else list(slices)  # of the frames in their phases
-    of_frames = zip(_frame_parts(data, "Phase", len(phases)), numbers, strict=False)
-    return [phase_starts[phase - 1] + (number - 1) * frame_steps[phase - 1] for phase, number in of_frames]
+    frames = zip(_frame_parts(data, "Phase", len(phases)), numbers, strict=False)
+    return [phase_starts[phase - 1] + (number - 1) * frame_steps[phase - 1] for phase, number in frames]
 
 
 def _frame_parts(data: Any, name: str, count: int) -> list[int]:
-    """Return the number, of `count`, of each frame's window, rotation or phase; without a vector, one for each block."""
+    """Return the number, 1 to `count`, of each frame's window, rotation or phase; without a vector, one for each block."""
     vector = data.get(f"{name.replace(' ', '')}Vector") or np.arange(1, count + 1)
     return [int(number) for number in np.atleast_1d(vector)]
 
@@ -404,9 +408,9 @@ def _frame_duration(place: Any) -> float:
     return float(place.get("ActualFrameDuration") or math.nan) / 1000
 
 
-def differs(recorded: float, other: float) -> bool:
-    """Return whether a length or time in a file differs from another by more than rounding; False if the file has NaN."""
-    return not (math.isnan(recorded) or math.isclose(recorded, other, rel_tol=_SAME_SIZE))
+def differs(recorded: float, expected: float) -> bool:
+    """Return whether a length or time in a file differs from `expected` by more than rounding; False for NaN in the file."""
+    return not (math.isnan(recorded) or math.isclose(recorded, expected, rel_tol=_SAME_SIZE))
 
 
 _READERS: dict[str, Callable[[Path, CountsLayout], Counts]] = {

@@ -28,9 +28,9 @@ from .recipe import Recipe, recorded_recipe
 from .run import ProjectionRun
 from .scatter_windows import ScatterWindows
 
-_MOST_NUMBERS = 1 << 20  # longest list of frames
-_MOST_EXACT = 1 << 24  # largest number up to which float32 holds all whole numbers
-_KEPT = ("system.", "attenuation.", "counts.", "model.", "detector.", "compute.")
+_MAX_FRAMES = 1 << 20  # length of the longest list of frames
+_MAX_EXACT = 1 << 24  # largest number up to which float32 holds all whole numbers
+_RECORDED = ("system.", "attenuation.", "counts.", "model.", "detector.", "compute.")  # settings that a run records
 
 
 def counts_run(
@@ -126,7 +126,7 @@ def counts_run(
     images = window_images["peak"]
     n_v, n_u = images.shape[1:]
     views = system.views((n_v, n_u), detector, magnification, pitch)
-    values = {key: value for key, value in recipe.given.items() if key.startswith(_KEPT)}
+    values = {key: value for key, value in recipe.given.items() if key.startswith(_RECORDED)}
     values |= {"model.kind": "emission", "model.time": time, "model.start": start, "detector.plane": detector}
     if efficiency is not None and np.ndim(efficiency) < 2:
         values["model.efficiency"] = np.asarray(efficiency).tolist()
@@ -144,8 +144,8 @@ def counts_run(
         estimate, record["scatter"] = scatter.estimate(window_images, indices, frames_read, efficiency)
     background = scale_by_module(model_recipe["model.background"], recorded_shares(model_recipe, images, record))
     background = background if estimate is None else with_image_axes(background) + estimate
-    more: Any = {"settings": record, "background": background, "efficiency": efficiency}
-    run = ProjectionRun(images, system, views, unit="counts", **more)
+    fields: Any = {"settings": record, "background": background, "efficiency": efficiency}
+    run = ProjectionRun(images, system, views, unit="counts", **fields)
     _warn_of_contradictions(frames_read, used, words, run)
     warn_of_frames(array, used, labels, frames_read.name, time, _declared_dead(run, words, used, array.shape))
     return run
@@ -224,7 +224,7 @@ def _parse_numbers(text: str) -> list[int | None]:
         if match is None:
             raise InputError(f"frames (--frames): {part!r} is no number, no range such as 1-20 or 20-1, and not none")
         first, last = int(match[1] or 1), int(match[2] or match[1] or match[3] or 1)
-        if abs(last - first) + len(numbers) >= _MOST_NUMBERS:
+        if abs(last - first) + len(numbers) >= _MAX_FRAMES:
             raise InputError(f"frames (--frames): {part} is more than a scanner has modules")
         step = 1 if last >= first else -1
         numbers += [number if match[1] else None for number in range(first, last + step, step)]
@@ -253,10 +253,10 @@ def _exposures(time: Any, counts: Counts, used: list[int], labels: list[str]) ->
     triples = zip(used, exposures, times, strict=True)
     contradictions = [(k, stated, seconds) for k, stated, seconds in triples if differs(stated, seconds)]
     for k, stated, seconds in contradictions[:1]:
-        more = f", and others of {len(contradictions) - 1} frames more" if len(contradictions) > 1 else ""
+        rest = f", and others of {len(contradictions) - 1} frames more" if len(contradictions) > 1 else ""
         hint = "leave it out to take the file's"
         pair = f"the file says {stated:g} s, the time (--time) is {seconds:g} s"
-        raise InputError(f"{counts.name}: {labels[k]}: {pair}{more}; {hint}")
+        raise InputError(f"{counts.name}: {labels[k]}: {pair}{rest}; {hint}")
     return _one_or_list(times)
 
 
@@ -317,7 +317,7 @@ def _require_counts(array: Array, expected: bool) -> None:
         require_finite(array, "counts")
     for is_wrong, problem in (
         (array < 0, "is below 0"),
-        (array > _MOST_EXACT, "is more than a pixel can hold exactly"),
+        (array > _MAX_EXACT, "is more than a pixel can hold exactly"),
         (array != np.rint(array) if array.dtype.kind == "f" and not expected else None, "is no whole number of counts"),
     ):
         if is_wrong is not None and is_wrong.any():

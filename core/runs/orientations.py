@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 _SIDES = {"front": ("From the Pinhole", -1), "back": ("From Behind", 1)}
 """Label, and direction of sight along k, by side."""
 _AXES = {"+u": (1, 0), "-u": (-1, 0), "+v": (0, 1), "-v": (0, -1)}
+"""Directions (u, v) by the names of the module's axes."""
 
 
 def _directions(word: str) -> tuple[tuple[int, int], tuple[int, int]]:

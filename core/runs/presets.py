@@ -28,7 +28,7 @@ class Preset:
     label: str
     """Name in menus."""
     text: str
-    """Line of help."""
+    """Help text of one line."""
     model: Mapping[str, Any]
     """Values by the settings' names in the table [model]."""
 
@@ -65,4 +65,4 @@ _ROWS = (
     _camera("Lu-177", "tungsten", "NaI"),
 )
 PRESETS: Mapping[str, Preset] = {preset.name: preset for preset in _ROWS}
-"""The presets by name."""
+"""Presets by name."""

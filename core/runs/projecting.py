@@ -2,25 +2,22 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
 from ..arrays import Array, ArrayLike, Floats32
 from ..errors import InputError, warn
 from ..geometry.scanner import Detector, Scanner
-from ..geometry.system import PinholeSystem
 from ..geometry.views import Views
 from ..memory import require
-from ..models.coefficient_checks import mu_warnings
 from ..physics.dead_time import dead_time_counts
 from ..physics.isotopes import photon_energy
 from ..physics.noise import sample_counts
 from ..progress import Progress
-from ..projector import Emission, Model, Projector, Transmission, intensity
+from ..projector import Model, Projector, intensity
 from ..validation import positive, seed_number
 from ..volumes.volume import Volume
-from ..xray.scan import SpectralScan
 from .counting import scale_by_module
 from .run import ProjectionRun
 
@@ -57,8 +54,8 @@ class Imaging:
 
         Warns of modules at rates beyond the maximum of a paralysable counter, whose counts could be those of a lower rate.
         """
-        (tau, kind), model = self.dead_time, self.model
-        if not tau or not isinstance(model, Emission):
+        (tau, kind), model = self.dead_time, cast(Any, self.model)
+        if not tau or not model.has_times:
             return np.ones((1, 1, 1), np.float32)
         totals = np.maximum(images.sum(axis=(1, 2), dtype=float), 1e-30)
         if kind == "paralysable" and (beyond := totals / model.time > 1 / tau).any():
@@ -83,17 +80,13 @@ class Imaging:
         """
         A = self.projector
         self.model.check_volume(volume)
-        if self.photons is not None and not (isinstance(self.model, Transmission) and volume.quantity == "mu"):
+        if self.photons is not None and not (self.model.has_photons and volume.quantity == "mu"):
             text = f"{self.model.name} of {volume.quantity}"
             raise InputError(f"photons: expected the transmission of a volume of mu, got {text}")
         warn_of_images(volume, A.views, self.model)
-        if mu is not None and isinstance(self.model, Emission):
-            for text in mu_warnings(mu, self.model):
-                warn(text)
-        if isinstance(self.model, SpectralScan):
-            images = self.model.counts(volume, A, progress)
-        else:
-            images = np.asarray(A(volume, progress, mu))
+        for text in () if mu is None else self.model.mu_warnings(mu):
+            warn(text)
+        images = self.model.expected_images(A, volume, progress, mu)
         for image, background in zip(images, A.background, strict=True):
             passed = image if self.photons is None else intensity(image, self.photons)
             image[...] = passed + background.astype(image.dtype)
@@ -155,7 +148,7 @@ def project_run(
     """
     photons = None if photons is None else positive(photons, "photons")
     if noise_seed is not None:
-        if photons is None and not (isinstance(model, Emission | SpectralScan) and model.unit(volume) == "counts"):
+        if photons is None and (model is None or model.unit(volume) != "counts"):
             raise InputError("noise_seed: only counts of an Emission or of X rays, or photons that pass, have noise")
         noise_seed = seed_number(noise_seed)
     views = system.views(shape=shape, detector=detector, magnification=magnification, pitch=pitch)
@@ -185,7 +178,7 @@ def warn_of_energy(model: Model, energy: float | str | None, source: str) -> Non
 
     `source` names the file or phantom of the mu, for the message.
     """
-    window = model.window if isinstance(model, Emission) else None
+    window = model.detected_energies
     if window is None or energy in (None, LINES):
         return
     energy = photon_energy(energy)
@@ -196,25 +189,9 @@ def warn_of_energy(model: Model, energy: float | str | None, source: str) -> Non
 
 def warn_of_images(volume: Volume, views: Views, model: Model) -> None:
     """Warn of activity below 0, pixels beside the crystals, and a volume that the modules do not see whole."""
-    lowest, highest = float(volume.array.min()), float(volume.array.max())
-    if isinstance(model, Emission) and lowest < -0.1 * abs(highest):  # interpolation leaves smaller values below 0
-        warn(f"the activity is {lowest:g} to {highest:g} kBq/mL: what is below 0 makes counts below 0")
-    if isinstance(model, Emission) and not model.within_crystal:
-        _warn_of_no_crystal(model.system, views)
-    _warn_of_unseen(volume, views, ends_at_plane=not isinstance(model, Emission))
-
-
-def _warn_of_no_crystal(system: PinholeSystem, views: Views) -> None:
-    """Warn of images of counts that reach beyond the crystal."""
-    magnification = np.linalg.norm(views.detector_centers - views.sources, axis=1) / system.collimator_length
-    steps = np.stack([views.u_steps, views.v_steps])
-    sides = np.linalg.norm(steps, axis=2) * np.array(views.shape[::-1])[:, None] / magnification  # on the crystal, mm
-    beyond = int(np.any(sides > 1.001 * system.detector_side, axis=0).sum())
-    if beyond:
-        warn(
-            f"{beyond} of {len(views)} images are wider than the crystal: pixels beside it count photons that nothing "
-            "detects, unless within_crystal (Crystal's Side) leaves them out"
-        )
+    for text in model.image_warnings(volume, views):
+        warn(text)
+    _warn_of_unseen(volume, views, model.ends_at_detector)
 
 
 def _warn_of_unseen(volume: Volume, views: Views, ends_at_plane: bool) -> None:

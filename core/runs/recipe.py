@@ -34,7 +34,7 @@ class Recipe(Values):
 
     @property
     def rows(self) -> Mapping[str, Setting]:
-        """All settings by their keys, with those of the phantom's kind."""
+        """Settings by their keys, those of the phantom's kind included."""
         return _rows(self.given)
 
     @staticmethod
@@ -92,8 +92,8 @@ def fitting_recipe(values: Mapping[str, Any], required: Collection[str] = ()) ->
 
 def recorded_recipe(recipe: Recipe) -> Recipe:
     """Return the recipe as a run keeps it: with this version's defaults of all settings that its images depend on."""
-    of_images = ("model.", "detector.", "compute.")
-    defaults = {key: setting.default for key, setting in SETTINGS.items() if key.startswith(of_images)}
+    tables = ("model.", "detector.", "compute.")
+    defaults = {key: setting.default for key, setting in SETTINGS.items() if key.startswith(tables)}
     return fitting_recipe({**defaults, **recipe.given}, recipe.given)
 
 

@@ -14,6 +14,7 @@ from ..geometry.system import PinholeSystem
 from ..memory import require
 from ..models.photon_lines import Mu
 from ..phantoms.derenzo import DerenzoRods
+from ..phantoms.settings import setting_names
 from ..physics.performance import resolution
 from ..progress import Stages
 from ..rays.backends import choose
@@ -25,7 +26,7 @@ from ..reconstruction.stopping import StoppingRule, StopWhen
 from ..volumes.resampling import resample
 from ..volumes.volume import Volume
 from ..volumes.volume_files import read_volume
-from ..xray.scan import SpectralScan
+from .model_kinds import model_class
 from .recipe import Recipe
 from .run import ProjectionRun
 from .run_recipe import projector_of_run, recipe_model, run_truth
@@ -270,8 +271,19 @@ def reconstruction_model(run: ProjectionRun, recipe: Recipe) -> Recipe:
     Unless `recipe` chooses otherwise, the model has the blur of the whole hole if the run's counts have it, else rays
     through as many points of the hole as the run's, at most 7.
     """
-    if recipe["model.kind"] != "emission":
+    model = model_class(recipe["model.kind"], run.system)
+    if not model.has_times:
         return recipe
+    changes = _hole_sampling(run, recipe) if "aperture_points" in setting_names(model) else {}
+    if recipe["reconstruction.ignore_blur"]:
+        changes["model.intrinsic_fwhm"] = None
+    if recipe["reconstruction.ignore_attenuation"]:
+        changes |= {key: None for key in recipe.given if key.startswith("attenuation.")}
+    return recipe.updated(changes)
+
+
+def _hole_sampling(run: ProjectionRun, recipe: Recipe) -> dict[str, Any]:
+    """Return the settings of the hole's blur in the reconstruction of a run, for `Recipe.updated`."""
     hole, points = recipe["reconstruction.hole"], recipe["reconstruction.aperture_points"]
     run_points = None if run.is_measured else 1 if recipe["model.hole"] == "point" else recipe["model.aperture_points"]
     is_whole = run_points is None or run_points >= _POINTS
@@ -284,11 +296,7 @@ def reconstruction_model(run: ProjectionRun, recipe: Recipe) -> Recipe:
     if hole == "rays":
         # The tolerance is that of single voxels' images; in a volume, errors of neighbours cancel.
         changes |= {"model.pixel_points": recipe["reconstruction.pixel_points"], "model.tolerance": 1e9}
-    if recipe["reconstruction.ignore_blur"]:
-        changes["model.intrinsic_fwhm"] = None
-    if recipe["reconstruction.ignore_attenuation"]:
-        changes |= {key: None for key in recipe.given if key.startswith("attenuation.")}
-    return recipe.updated(changes)
+    return changes
 
 
 def _is_fast_by_depth(recipe: Recipe) -> bool:
@@ -309,8 +317,7 @@ def line_integrals(run: ProjectionRun, recipe: Recipe) -> Floats32:
     """
     photons = recipe["model.photons"]
     if recipe["model.kind"] == "spectral":
-        model = recipe_model(recipe, run.system)
-        assert isinstance(model, SpectralScan)
+        model: Any = recipe_model(recipe, run.system)
         return model.line_integrals(run.projections, run.views, not recipe["reconstruction.ignore_beam_hardening"])
     if photons is None:
         return run.projections

@@ -29,23 +29,23 @@ from ..physics.ct_numbers import hu_to_mu
 from ..physics.isotopes import photon_energy
 from ..physics.noise import NOISE_MODELS
 from ..progress import Progress, Stages
-from ..projector import Emission, InverseSquareSum, Model, Projector, Transmission
+from ..projector import Model, Projector
 from ..volumes.rearranging import centered
 from ..volumes.volume import Volume
 from ..volumes.volume_files import read_volume, read_volume_of
 from ..workbook import read_scanner
 from ..xray.detectors import checked_bins
-from ..xray.scan import SpectralScan
 from .counting import recipe_dead_time, recipe_efficiency, recorded_shares, scale_by_module
 from .measured import recipe_counts
+from .model_kinds import model_class
 from .projecting import LINES, Imaging, project_run, warn_of_energy
 from .recipe import Recipe, recorded_recipe
 from .run import ProjectionRun
+from .settings import SETTINGS
 
-_MODELS: dict[str, Any] = {
-    "transmission": Transmission, "emission": Emission, "spectral": SpectralScan, "inverse-square": InverseSquareSum,
-}  # fmt: skip
 _MODULES, _EFFICIENCY = "system.modules", "model.efficiency"
+_OUTSIDE_MODEL = {"kind", "photons", "dead_time", "dead_time_kind", "opening_angle_degrees", "efficiency"}
+"""Names of settings of [model] that are no arguments of the models' classes."""
 _MU_ADVICE = "; of mu, give the energy at which it holds (--energy)"
 _MOST_MU = 500.0
 """Attenuation coefficient, 1/mm, above that of all materials of the tables for photons of 10 keV or more."""
@@ -100,7 +100,7 @@ def run_recipe(
     frames = recipe_frames(recipe)
     energy = recipe["volume.energy"] or recipe["attenuation.energy"]
     converted = {}
-    if energy not in (None, LINES) and not isinstance(model, SpectralScan):
+    if energy not in (None, LINES) and not model.takes_ct_numbers:
         converted["ct_converted_at_kev"] = photon_energy(energy)
     for number, ((source, mu_of_it, record), times) in enumerate(_in_frames(sources, frames)):
         record, seed = record.updated(times), recipe["noise.seed"]
@@ -181,14 +181,17 @@ def recipe_model(recipe: Recipe, system: Scanner, mu: Mu | None = None, run: Pro
     The model of a `run` has the run's efficiency, if that is the recipe's, and the fractions of photons that its dead time
     left as factors of efficiency and background: the counts then have Poisson noise around the model's expected counts.
     """
-    cls = _MODELS[recipe["model.kind"]]
+    cls: Any = model_class(recipe["model.kind"], system)
+    names = set(setting_names(cls))
     arguments = recipe.fields("model", cls)
     if arguments.get("pixel_points") == "auto":
         arguments["pixel_points"] = None
-    if cls is Emission:
+    if cls.has_times:
+        _require_known_settings(recipe, names, system)
         if "model.opening_angle_degrees" in recipe.given:
             arguments["opening_angle"] = math.radians(recipe["model.opening_angle_degrees"])
-        arguments["mu"] = mu
+        if mu is not None:
+            arguments["mu"] = mu
         if run is not None and "recipe" in run.settings and run.recipe[_EFFICIENCY] == recipe[_EFFICIENCY]:
             arguments["efficiency"] = run.efficiency
         else:
@@ -197,12 +200,22 @@ def recipe_model(recipe: Recipe, system: Scanner, mu: Mu | None = None, run: Pro
             shares = recorded_shares(recipe, run.projections, run.settings)
             for name in ("background", "efficiency"):
                 arguments[name] = scale_by_module(arguments.get(name, 0.0), shares)
-    model: Model = cls(**arguments) if cls is Transmission else cls(system, **arguments)
-    if isinstance(model, Emission) and len(files := recipe["attenuation.file"] or ()) > 1:
+    if "system" in names:
+        arguments["system"] = system
+    model: Model = cls(**arguments)
+    if model.has_times and len(files := recipe["attenuation.file"] or ()) > 1:
         require_one_per_line(len(files), model.photon_lines, "attenuation.file", "file")
         if recipe["attenuation.energy"] is not None:
             raise InputError("attenuation.energy: it is for one file of CT numbers; a file for each line holds mu")
     return model
+
+
+def _require_known_settings(recipe: Recipe, names: set[str], system: Scanner) -> None:
+    """Raise `InputError` for a setting that the model of counts of a scanner, with arguments `names`, does not have."""
+    for key, value in recipe.given.items():
+        table, _, name = key.partition(".")
+        if table == "model" and name not in names | _OUTSIDE_MODEL and value != SETTINGS[key].default:
+            raise InputError(f"{key}: is no setting of the counts of a scanner of the kind {system.kind}")
 
 
 def projector_of_run(
@@ -239,7 +252,7 @@ def projector_of_run(
     """
     recipe = run.recipe if recipe is None else recipe
     if mu is None and recipe["model.kind"] == "emission":
-        model = recipe_model(recipe, run.system, run=run)
+        model: Any = recipe_model(recipe, run.system, run=run)
         if recipe["attenuation.of_phantom"]:
             mu = _mu_of_phantom(recipe_phantom(recipe), phantom_pose(recipe), grid, model, stages)
         elif recipe["volume.center"] and recipe["attenuation.file"] is not None:
@@ -247,10 +260,8 @@ def projector_of_run(
             raise InputError(f"attenuation.file: {moved}; give mu where it was then")
         else:
             mu = _recipe_attenuation(recipe, model, stages)
-    model = recipe_model(recipe, run.system, mu, run)
-    if isinstance(model, SpectralScan):  # its images are converted to line integrals
-        model = Transmission()
-    if isinstance(model, Emission) and np.ndim(run.background) == 3:  # such as scatter, which is in no recipe
+    model = recipe_model(recipe, run.system, mu, run).linear()
+    if model.has_times and np.ndim(run.background) == 3:  # such as scatter, which is in no recipe
         own_background = recipe_model(run.recipe, run.system, run=run).background if "recipe" in run.settings else 0.0
         excess = np.maximum(run.background - with_image_axes(own_background), 0)
         model = replace(model, background=with_image_axes(model.background) + excess)
@@ -307,9 +318,9 @@ def _from_files(recipe: Recipe, record: Recipe, model: Model, mu: Mu | None, sta
 
 def _in_model_quantity(volume: Volume, model: Model, energy: float | str | None) -> Volume:
     """Return a volume in the quantity that the model images; `energy` of its mu is in keV, or an isotope's name."""
-    if not isinstance(model, SpectralScan):
+    if not model.takes_ct_numbers:
         return volume
-    return model.at_ct_energy(volume, None if energy is None else photon_energy(energy))
+    return model.in_model_quantity(volume, None if energy is None else photon_energy(energy))
 
 
 def _read_volume(path: str, recipe: Recipe, progress: Progress | None) -> Volume:

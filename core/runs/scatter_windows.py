@@ -68,7 +68,7 @@ class ScatterWindows:
         images, used
             Images (M, n_v, n_u), and the indices of their frames in `found`, by the windows "peak", "lower" and "upper".
         found
-            All frames.
+            Frames of the files, with the energies and exposures that the files state.
         efficiency
             Detection efficiency of the images.
 

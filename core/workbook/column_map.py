@@ -18,7 +18,7 @@ from .headings import parse_unit
 from .sheet_xml import MAX_COLUMN, MAX_ROW
 
 RowMatching = Literal["by number", "in order", "one for all"]
-"""How the rows of a table are matched with the rows of the first table."""
+"""Rule by which the rows of a table are matched with the rows of the first table."""
 
 _HELP = "see docs/workbook.md"
 _KEYS = {"sheet": str, "header_row": int, "first_row": int, "last_row": int, "skip_rows": list}

@@ -163,7 +163,7 @@ def test_a_background_that_is_given_twice_is_named(system, form):
     counts = np.random.default_rng(3).poisson(9.0, A.shape_out)
     for method in (mph.osem, mph.bsrem):
         (text,) = warned(lambda method=method: method(A, counts, 1, background=background))
-        assert text.startswith("background: 1.5 counts a pixel, besides the 1.5 of the projector's model")
+        assert text.startswith("background: 1.5 counts per pixel, besides 1.5 of the projector's model")
         assert warned(lambda method=method: method(A, counts, 1)) == []
     bare = mph.Projector(GRID, views, mph.Emission(system, **USUAL))
     assert warned(lambda: mph.mlem(bare, counts, 1, background=background)) == []
@@ -212,7 +212,7 @@ def test_every_method_of_counts_doubts_their_order(system, method, rng):
     counts = rng.poisson(A(ball(GRID, (25, 10, -5), 20)))
     assert warned(lambda: method(A, counts, 1)) == []
     (text,) = warned(lambda: method(A, counts[::-1], 1))
-    assert text.startswith("counts: likelier of the modules in reversed order (log-likelihood ")
+    assert text.startswith("counts: likelier with the modules in reversed order (log-likelihood ")
     run = mph.counts_run(counts[::-1], system, "112-101", "back-v", 3e5)
     assert warned(lambda: method(A, run.projections, 1)) == [], "each frame is its module's again"
 

@@ -12,7 +12,7 @@ from scipy.ndimage import gaussian_filter
 from scipy.special import i0e
 
 import mphdrr.core as mph
-from mphdrr.core.reconstruction.scores.derenzo import LIGHTS, SEEN_BELOW
+from mphdrr.core.reconstruction.scores.derenzo import LIGHTS, VISIBLE_CHANCE
 
 RODS = (6.0, 5.0, 4.0, 3.5, 3.0, 0.0)
 DISTANCES = np.concatenate([np.linspace(0, 15, 301), [100]])  # mm
@@ -149,7 +149,7 @@ def test_without_noise_rayleighs_limit_alone_decides(phantom, voxel):
                 ):  # a valley between two rods that differ proves little
                     continue
                 assert sector.resolved == (sector.valley_to_peak < 0.735), (fwhm, sector.rod_diameter)
-                light = "green" if sector.resolved else "amber" if sector.chance < SEEN_BELOW else "red"
+                light = "green" if sector.resolved else "amber" if sector.chance < VISIBLE_CHANCE else "red"
                 assert sector.light == light and sector.words.startswith(f"{LIGHTS[light]}, ")
                 seen.add(sector.resolved)
     assert seen == {0.0, 1.0}

@@ -7,6 +7,8 @@ from scipy.special import lambertw
 import mphdrr.core as mph
 from mphdrr.core.physics.dead_time import live_shares
 
+from .conftest import refused
+
 KINDS = ["non-paralysable", "paralysable"]
 ACTIVE = {
     "phantom.text": "[[shape]]\nkind = 'sphere'\nradius = 30\nactivity = 5\n", "phantom.voxels": 8, "phantom.spacing": 10.0,
@@ -52,8 +54,7 @@ def test_what_no_counter_records_is_refused():
         ):
             mph.dead_time_corrected([1.0, 1.01 * most], 1.0, 1e-6, kind)
     for bad in ([[-1.0], 1.0, 1e-6], [[1.0], 0.0, 1e-6], [[1.0], 1.0, -1e-6], [[1.0, 2.0], [1.0] * 3, 1e-6]):
-        with pytest.raises(mph.InputError):
-            mph.dead_time_counts(*bad)
+        refused(lambda bad=bad: mph.dead_time_counts(*bad))
     with pytest.raises(mph.InputError, match="kind 'both': expected one of non-paralysable, paralysable"):
         mph.dead_time_counts([1.0], 1.0, 1e-6, "both")
 

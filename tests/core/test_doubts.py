@@ -11,21 +11,13 @@ import pytest
 import mphdrr.core as mph
 from mphdrr.core import events
 from mphdrr.core.events.templates import TEMPLATES, template_text
-from mphdrr.core.recording import recorded_warnings
 from mphdrr.core.runs.presets import PRESETS
 
-from .conftest import EVENT_RECIPE, WORKBOOK
+from .conftest import EVENT_RECIPE, WORKBOOK, warned
 from .small_events import small_recipe
 
 GRID = mph.Grid.centered(8, 12.0)
 USUAL = {"hole": "point", "pixel_points": 1, "tolerance": 1e9}
-
-
-def warned(call) -> list[str]:
-    with recorded_warnings() as texts:
-        call()
-    assert not any("\n" in text for text in texts)
-    return texts
 
 
 def full(value: float, grid: mph.Grid = GRID, quantity: str = "mu") -> mph.Volume:

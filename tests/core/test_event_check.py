@@ -8,10 +8,10 @@ from pathlib import Path
 
 import pytest
 
-import mphdrr.core as mph
 from mphdrr.addon.cli import main
 from mphdrr.core import events
 
+from .conftest import refused
 from .small_events import TEXT, WORKBOOK, small_recipe
 from .test_event_work import tree
 
@@ -202,5 +202,4 @@ def test_status(tmp_path, made, capsys):
     assert main(["events", "status", str(made)]) == 1
     assert "no event set" in capsys.readouterr().err
     assert events.status(folder) == events.Status(**found)
-    with pytest.raises(mph.InputError, match="no event set"):
-        events.check(tmp_path)
+    refused(lambda: events.check(tmp_path), "no event set")

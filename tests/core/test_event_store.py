@@ -24,6 +24,7 @@ from mphdrr.core.events import store as stores
 from mphdrr.core.events.folders import SetFolder
 from mphdrr.core.events.store import Store
 
+from .conftest import refused
 from .small_events import TEXT, small_recipe
 from .test_event_work import tree
 
@@ -191,8 +192,7 @@ def test_a_set_of_an_earlier_version_opens_and_goes_on(whole, made):
     data = bytearray((whole / "shards" / "000000.tar").read_bytes())
     data[3000] ^= 1
     (whole / "shards" / "000000.tar").write_bytes(data)
-    with pytest.raises(mph.InputError, match="changed"):
-        _ = events.EventSet(whole)[0].pose
+    refused(lambda: events.EventSet(whole)[0].pose, "changed")
 
 
 def test_two_works_pack_one_after_the_other(whole):
@@ -373,8 +373,7 @@ def test_an_event_that_is_not_as_it_should_be_is_refused_by_name(whole, change, 
     path = whole / "events" / "000002.h5"
     change(path, edit)
     event = events.EventSet(whole)[2]
-    with pytest.raises(mph.InputError, match=f"000002.h5: .*{said}"):
-        _ = event.pose, event.images("lines")
+    refused(lambda: (event.pose, event.images("lines")), f"000002.h5: .*{said}")
 
 
 @pytest.mark.parametrize("count", [60, pytest.param(200, marks=pytest.mark.long)])

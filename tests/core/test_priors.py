@@ -7,6 +7,8 @@ import pytest
 
 import mphdrr.core as mph
 
+from .conftest import refused
+
 KINDS = [mph.Quadratic, mph.RelativeDifference, mph.TotalVariation]
 SHAPE, SPACING = (4, 5, 6), (1.0, 2.0, 1.5)
 
@@ -154,12 +156,9 @@ def test_the_most_similar_neighbours_are_chosen(grid, rng):
     ],
 )
 def test_wrong_numbers_are_refused(make, words):
-    with pytest.raises(mph.InputError, match=words):
-        make()
+    refused(make, words)
 
 
 def test_anatomy_on_another_grid_is_refused(grid, anatomy):
-    with pytest.raises(mph.InputError, match="anatomy's grid is not"):
-        mph.Quadratic(1, anatomy=anatomy).on(mph.Grid.centered(SHAPE, 1.0))
-    with pytest.raises(mph.InputError, match="prior: similar: expected at most the 6"):
-        mph.Quadratic(1, anatomy=anatomy, similar=7)
+    refused(lambda: mph.Quadratic(1, anatomy=anatomy).on(mph.Grid.centered(SHAPE, 1.0)), "anatomy's grid is not")
+    refused(lambda: mph.Quadratic(1, anatomy=anatomy, similar=7), "prior: similar: expected at most the 6")

@@ -16,6 +16,8 @@ from mphdrr.core.runs.recipe import Recipe
 from mphdrr.core.runs.run_recipe import euler_degrees, phantom_pose
 from mphdrr.core.runs.settings import SETTINGS
 
+from .conftest import refused
+
 AS_SHIPPED = True  # compared with voxels of every Python
 
 DATA = Path(__file__).parent / "data"
@@ -108,8 +110,7 @@ def test_a_changed_recipe_keeps_what_still_holds_and_no_more():
     assert moved["phantom.sphere_activity"] == 3
     assert "phantom.sphere_activity" not in made.updated({"phantom.kind": "jaszczak"}).given
     only_matrix = Recipe({"phantom.matrix": made["phantom.matrix"]}).updated({"phantom.position": (9, 0, 0)})
-    with pytest.raises(mph.InputError, match="another pose"):
-        phantom_pose(only_matrix)
+    refused(lambda: phantom_pose(only_matrix), "another pose")
 
 
 @pytest.mark.parametrize("centered", [False, True])
@@ -129,8 +130,7 @@ def test_a_run_made_again_is_attenuated_again(centered, workbook, tmp_path, caps
     assert runs[0].projections.max() > 0
     np.testing.assert_array_equal(runs[1].projections, runs[0].projections)
     if not centered:
-        with pytest.raises(mph.InputError, match="needs its mu as well"):
-            next(mph.run_recipe(runs[0].recipe, volume=runs[0].volume))
+        refused(lambda: next(mph.run_recipe(runs[0].recipe, volume=runs[0].volume)), "needs its mu as well")
 
 
 @pytest.mark.long
@@ -192,8 +192,7 @@ def test_angles_and_matrix_say_the_same_pose(rng):
     np.testing.assert_allclose(phantom_pose(both), pose)
     moved = both.updated({"phantom.position": (0, 0, 0)})
     assert "phantom.matrix" not in moved.given
-    with pytest.raises(mph.InputError, match="another pose"):
-        phantom_pose(Recipe({**both.given, "phantom.position": (0, 0, 0)}))
+    refused(lambda: phantom_pose(Recipe({**both.given, "phantom.position": (0, 0, 0)})), "another pose")
     assert euler_degrees(np.diag([2.0, 1, 1, 1])) is None
 
 

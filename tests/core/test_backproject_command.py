@@ -12,6 +12,8 @@ import mphdrr.core as mph
 from mphdrr.core.cli import backproject as command_module
 from mphdrr.core.cli import main
 
+from .conftest import refused_command
+
 COUNTS = {"model.kind": "emission", "model.time": 60.0, "model.hole": "point", "model.pixel_points": 1,
           "model.tolerance": 1e9, "detector.rows": 24, "detector.columns": 20, "detector.plane": "real",
           "phantom.kind": "derenzo", "phantom.voxels": 30}  # fmt: skip
@@ -21,9 +23,7 @@ GRID = mph.Grid.centered((18, 17, 16), 4.0, (3, 2, 1))
 
 
 def made(scanner, **changes) -> mph.ProjectionRun:
-    (run,) = mph.run_recipe(
-        mph.Recipe(COUNTS).updated({key.replace("__", "."): v for key, v in changes.items()}), scanner
-    )
+    (run,) = mph.run_recipe(mph.Recipe(COUNTS).updated(changes), scanner)
     return run
 
 
@@ -36,12 +36,6 @@ def run(scanner) -> mph.ProjectionRun:
 def file(run, tmp_path) -> str:
     mph.write_run(run, tmp_path / "run.npz")
     return str(tmp_path / "run.npz")
-
-
-def refused(capsys, *words: object) -> str:
-    assert main(["backproject", *map(str, words)]) == 1
-    (line,) = capsys.readouterr().err.splitlines()
-    return line
 
 
 @pytest.mark.parametrize("changes", [
@@ -117,21 +111,26 @@ def test_noise_below_the_background_is_none(run):
 @pytest.mark.filterwarnings("ignore::mphdrr.core.errors.InputWarning")
 def test_what_is_not_understood_is_refused_before_anything_is_written(scanner, run, file, tmp_path, capsys):
     output = tmp_path / "b.nii.gz"
-    assert "no such file" in refused(capsys, tmp_path / "none.h5", "-o", output)
-    assert ".nii.gz" in refused(capsys, file, "-o", tmp_path / "b.txt")
-    assert "same file as --output" in refused(capsys, file, "-o", output, "--views-that-see", output)
-    assert "voxels" in refused(capsys, file, "--voxels", "0", "-o", output)
-    assert "no view sees any" in refused(capsys, file, *SMALL, "--center", "0", "0", "5000", "-o", output)
+    for words, said in (
+        ([tmp_path / "none.h5", "-o", output], "no such file"),
+        ([file, "-o", tmp_path / "b.txt"], ".nii.gz"),
+        ([file, "-o", output, "--views-that-see", output], "same file as --output"),
+        ([file, "--voxels", "0", "-o", output], "voxels"),
+        ([file, *SMALL, "--center", "0", "0", "5000", "-o", output], "no view sees any"),
+    ):
+        assert said in refused_command(capsys, "backproject", *words)
     assert main(["backproject", file, "--how", "mean", "-o", str(output)]) == 2
     assert main(["backproject", file]) == 2
     capsys.readouterr()
     other = made(scanner[::8], **{"model.kind": "inverse-square"})
     mph.write_run(other, tmp_path / "other.npz")
-    assert "inverse-square are no line integrals" in refused(capsys, tmp_path / "other.npz", "-o", output)
+    said = refused_command(capsys, "backproject", tmp_path / "other.npz", "-o", output)
+    assert "inverse-square are no line integrals" in said
     wide = made(scanner[::8], **{"detector.pitch": 4.0, "model.within_crystal": True})
     mph.write_run(wide, tmp_path / "wide.npz")
     for how in ("product", "minimum"):
-        assert "beyond the crystals" in refused(capsys, tmp_path / "wide.npz", "--how", how, "-o", output)
+        said = refused_command(capsys, "backproject", tmp_path / "wide.npz", "--how", how, "-o", output)
+        assert "beyond the crystals" in said
     assert mph.backproject_run(wide, grid=GRID).array.max() > 0
     assert not output.exists()
 

@@ -16,6 +16,9 @@ AS_SHIPPED = True  # its bounds are of these counts
 PRIORS = [mph.Quadratic(0.1), mph.RelativeDifference(2.0), mph.TotalVariation(1.0, edge=5.0)]
 
 
+ANATOMY = mph.Volume(np.ones((2, 2, 2)), mph.Grid.centered(2, 1), "mu")
+
+
 class Problem(NamedTuple):
     A: mph.Projector
     counts: np.ndarray
@@ -201,10 +204,7 @@ def test_no_counts_are_no_activity(small):
         ({"subsets": 0}, "subsets: expected a whole number"),
         ({"prior": 3}, "prior: expected Quadratic, RelativeDifference or TotalVariation, got int"),
         ({"prior": mph.Quadratic}, "prior: expected Quadratic"),
-        (
-            {"prior": mph.Quadratic(1, anatomy=mph.Volume(np.ones((2, 2, 2)), mph.Grid.centered(2, 1), "mu"))},
-            "prior: anatomy's grid",
-        ),
+        ({"prior": mph.Quadratic(1, anatomy=ANATOMY)}, "prior: anatomy's grid"),
     ],
 )
 @pytest.mark.parametrize("method", [mph.osem, mph.bsrem])

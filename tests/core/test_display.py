@@ -109,9 +109,8 @@ def test_the_central_half_is_shown_with_its_own_totals_in_the_window_of_all(shap
     assert np.array_equal(display.part(images[:, ::-1, ::-1]), middle[:, ::-1, ::-1]), "seen from any side"
     drawn, own = sheet(images, [1, 2], [0, 0], "counts", display), Display(high=50.0)
     assert drawn.window == (0.0, 50.0), "the largest of all exact numbers"
-    np.testing.assert_array_equal(
-        drawn.picture[:, :-200], sheet(middle, [1, 2], [0, 0], "counts", own).picture[:, :-200]
-    )
+    expected = sheet(middle, [1, 2], [0, 0], "counts", own).picture
+    np.testing.assert_array_equal(drawn.picture[:, :-200], expected[:, :-200])
     np.testing.assert_allclose(drawn.totals, middle.sum(axis=(1, 2), dtype=float))
 
 

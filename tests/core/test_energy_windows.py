@@ -275,11 +275,8 @@ def test_a_recipe_takes_tails_off(system, frames, tmp_path):
     (run,) = mph.run_recipe(recipe_of(path, **given), system)
     shares = peak_shares(mph.isotope("Tc-99m"), EDGES, 0.1)
     np.testing.assert_allclose(run.background, scatter_of(frames, shares=shares).clip(min=0), rtol=1e-5, atol=1e-5)
-    refused(
-        lambda: mph.run_recipe(recipe_of(path, **{"counts.scatter_tails": True}), system),
-        "scatter_tails",
-        "isotope",
-    )
+    bare = recipe_of(path, **{"counts.scatter_tails": True})
+    refused(lambda: mph.run_recipe(bare, system), "scatter_tails", "isotope")
     np.save(tmp_path / "c.npy", frames)
     unsaid = recipe_of(tmp_path / "c.npy", **given, **{"counts.window_widths": WIDTHS})
     refused(lambda: list(mph.run_recipe(unsaid, system)), "energies", "lower window's")

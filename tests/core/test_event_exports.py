@@ -61,13 +61,8 @@ def test_rings_of_several_sizes_need_a_table(scanner, tmp_path):
     slots = read_slots(tmp_path / "t.csv", some)
     assert slots.modules.tolist() == [5, 0] and slots.mirrored.tolist() == [False, True]
     heading = "slot,module,mirrored\n"
-    wrong = {
-        "slot,module\n": "mirrored",
-        heading: "no slots",
-        f"{heading}0,99,0\n": "line 2",
-        f"{heading}1,1,0\n": "from 0",
-    }
-    for text, found in wrong.items():
+    wrong = {"slot,module\n": "mirrored", heading: "no slots", f"{heading}0,99,0\n": "line 2"}
+    for text, found in (wrong | {f"{heading}1,1,0\n": "from 0"}).items():
         (tmp_path / "t.csv").write_text(text)
         refused(lambda: read_slots(tmp_path / "t.csv", some), found)
 
@@ -176,14 +171,7 @@ def test_webdataset_has_an_event_a_key_in_shards_of_a_split(event_set, tmp_path)
     for name, sample in samples.items():
         shard, key = name.split()
         event = event_set[int(key)]
-        assert set(sample) == {
-            "truth.npy.gz",
-            "counts.npy.gz",
-            "rays.npy.gz",
-            "radon16.npy.gz",
-            "radon6.npy.gz",
-            "json",
-        }
+        assert set(sample) == {"json", *(f"{name}.npy.gz" for name in ("truth", "counts", "rays", "radon16", "radon6"))}
         assert np.array_equal(sample["truth.npy.gz"], event.truth.array)
         assert np.array_equal(sample["rays.npy.gz"], event.images("rays"))
         said = sample["json"]

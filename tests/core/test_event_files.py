@@ -122,10 +122,8 @@ def test_every_changed_byte_is_noticed(small, tmp_path):
 def test_bytes_do_not_depend_on_threads_or_on_what_was_made_before(small):
     recipe = small.recipe
     system = small.system
-    geometry = {
-        "projection_matrix": (small[0].views.projection_matrices(), "pixel"),
-        "number": (system.numbers, "1"),
-    }
+    matrices = small[0].views.projection_matrices()
+    geometry = {"projection_matrix": (matrices, "pixel"), "number": (system.numbers, "1")}
     for threads in (1, 3):
         maker = events.EventMaker(recipe, threads)
         for number in (1, 0, 1):

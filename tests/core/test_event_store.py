@@ -112,10 +112,7 @@ def test_a_kill_while_packing_loses_nothing(whole, made, at, monkeypatch):
             raise KeyboardInterrupt
 
     monkeypatch.setattr(stores, "_write_member", killed)
-    monkeypatch.setattr(
-        stores, "_flush", lambda file, end, batch: None if len(written) == 2 else real(file, end, batch)
-    )
-    real = flush
+    monkeypatch.setattr(stores, "_flush", lambda *batch: None if len(written) == 2 else flush(*batch))
     with pytest.raises(KeyboardInterrupt):
         store.pack()
     monkeypatch.undo()
@@ -210,7 +207,7 @@ def test_readers_go_on_while_a_set_is_packed(whole, made):
     there = events.EventSet(whole)
     packed(whole)
     for event, other in zip(there, events.EventSet(made), strict=True):
-        assert np.array_equal(event.images("lines"), other.images("lines"))
+        assert_same_event(event, other)
 
 
 def test_writers_of_the_same_events_overlap_without_harm(tmp_path, made, monkeypatch):
@@ -396,10 +393,9 @@ def test_a_loader_skips_damaged_events_where_asked(whole):
     path.write_bytes(path.read_bytes()[:-100])
     (whole / "events" / "000003.h5").unlink()
     there = events.EventSet(whole)
-    with pytest.raises(mph.InputError, match=r"000001\.h5: cut"):
-        list(torch.utils.data.DataLoader(events.torch_dataset(there, "lines"), batch_size=2))
-    with pytest.raises(mph.InputError, match=r"000001\.h5: cut"):
-        list(torch.utils.data.DataLoader(events.torch_dataset(there, "lines"), num_workers=1))
+    for options in ({"batch_size": 2}, {"num_workers": 1}):
+        with pytest.raises(mph.InputError, match=r"000001\.h5: cut"):
+            list(torch.utils.data.DataLoader(events.torch_dataset(there, "lines"), **options))
     chosen = events.torch_dataset(there, ("lines", "truth"), skip_damaged=True)
     with pytest.warns(mph.InputWarning, match=r"000001\.h5: cut.*left out"):
         batches = list(torch.utils.data.DataLoader(chosen, batch_size=2))

@@ -79,11 +79,8 @@ def test_plot_drr_shows_each_image_as_it_is(pyplot, rng):
         assert len(shown) == len(pictures)
         for ax, picture in zip(shown, pictures, strict=True):
             np.testing.assert_allclose(ax.images[-1].get_array(), picture, rtol=1e-6)
-            assert (
-                ax.get_xlabel() == "a title"
-                and ax.get_xticks().tolist() == [0, 6]
-                and ax.get_yticks().tolist() == [0, 4]
-            )
+            assert ax.get_xlabel() == "a title"
+            assert (ax.get_xticks().tolist(), ax.get_yticks().tolist()) == ([0, 6], [0, 4])
     assert not len(plot_drr(images[0, 0], ticks=False)[0].get_xticks())
     refused(lambda: plot_drr(images[0, 0, :, 0]), "B x C x height x width, got 5")
     refused(lambda: plot_drr(images[0], axs=axes), "3 images, but 2 axes")

@@ -92,13 +92,8 @@ def test_what_is_behind_is_neither_seen_nor_imaged():
 
 def test_isocentre_from_the_numbers_of_a_module_is_that_of_the_points(system):
     system = system.replace(tilt=0.0)
-    numbers = (
-        system.pinhole_distance,
-        system.pinhole_diameter,
-        system.collimator_length,
-        system.detector_side,
-        system.detector_thickness,
-    )
+    names = ("pinhole_distance", "pinhole_diameter", "collimator_length", "detector_side", "detector_thickness")
+    numbers = [getattr(system, name) for name in names]
     counts = {"crystal_mu": 0.2, "photons_per_decay": 0.5}
     found = mph.isocentre_performance(*numbers, intrinsic_fwhm=2.5, **EDGE, **counts)
     origin = np.zeros((1, 3))

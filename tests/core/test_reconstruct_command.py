@@ -431,16 +431,8 @@ def test_a_picture_as_low_as_an_editor_has_legible_texts_and_all_that_matters(ru
     page, grid = Page(1048, 223, DARK, 14.0), mph.Grid.centered(16, 6.0)
     rods = [("8 mm", "green", "0.12", "80 %"), ("6 mm", "amber", "0.81", "9 %"), ("4 mm", "red", "1.02", "-1 %"),
             ("2 mm", "", "voxels of 6 mm are larger than the rods", "")]  # fmt: skip
-    draw(
-        page,
-        mph.resample(run.volume, grid, "mean"),
-        [1.0, 2.0],
-        run.volume,
-        "Of it",
-        ["OSEM", "it flatters"],
-        "fit",
-        rods,
-    )
+    mean = mph.resample(run.volume, grid, "mean")
+    draw(page, mean, [1.0, 2.0], run.volume, "Of it", ["OSEM", "it flatters"], "fit", rods)
     page.write(tmp_path / "p.svg")
     marks = (tmp_path / "p.svg").read_text(encoding="utf-8")
     sizes = re.findall(r'<text x="([0-9.]+)" y="([0-9.]+)" font-size="([0-9.]+)"', marks)

@@ -11,6 +11,7 @@ Everything imported here is the public interface. Arguments that cannot be used 
 
 from typing import TYPE_CHECKING
 
+from . import method_files as method_files  # enters its rows into the registry of `reconstruction`
 from .lazy import public
 
 if TYPE_CHECKING:

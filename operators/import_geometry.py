@@ -32,7 +32,7 @@ def draw_losses(layout: bpy.types.UILayout, losses: Iterable[str]) -> None:
 
 
 class MPHDRR_OT_import_geometry(bpy.types.Operator):
-    """Read a workbook of pinhole modules and build the scanner: a camera, a collimator and a crystal each"""
+    """Read a workbook of pinhole modules and build the scanner: a camera, a collimator and a crystal each."""
 
     bl_label = "Import Pinhole Geometry"
     bl_options = {"REGISTER", "UNDO"}

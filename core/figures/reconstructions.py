@@ -115,7 +115,7 @@ def _draw_texts(
     def write(text: str, size: float, color: str) -> None:
         """Write a text, wrapped to the column's width, below the last row."""
         nonlocal row
-        for line in letters.wrapped(text, lambda piece: letters.width(piece, size) <= width):
+        for line in letters.wrap_text(text, lambda piece: letters.width(piece, size) <= width):
             row += 1.35 * size
             page.text(line, left, row, size, color)
 

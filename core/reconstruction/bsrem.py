@@ -10,6 +10,7 @@ from ..progress import Progress, tell
 from ..projector import Projector
 from ..projector.subsets import access_order
 from ..validation import at_least_0
+from .arguments import argument
 from .counts import LEAST, CountLoop
 from .loop import IterativeOptions, waiting
 from .priors import Prior
@@ -30,6 +31,7 @@ _MOST_HALVINGS = 20
 """After so many halvings nothing is gained by smaller steps."""
 
 
+@argument("step_decay", float, "Steps are 1 / (1 + this times the number of iterations before)", least=0, slider=1)
 def bsrem(
     A: Projector,
     counts: ArrayLike,
@@ -41,7 +43,7 @@ def bsrem(
     *options: Any,
     **named: Unpack[IterativeOptions],
 ) -> Reconstruction:
-    """The activity with the largest penalised likelihood, ``log-likelihood - prior``: it ends there, as OSEM does not.
+    """Reconstruct the activity that maximises ``log-likelihood - prior`` (BSREM); converges to the maximum, unlike OSEM.
 
     Each iteration takes a step for each subset of the views, ``x <- x + step * x / (s + x c) * gradient``, with s the
     sensitivity and c the prior's curvature (and x lifted a little, so that zeros can grow). In the first iteration the
@@ -106,7 +108,7 @@ def bsrem(
         return part.T(own.ratio(loop.images(s, x, asked)), asked) - loop.seen[s]
 
     def moved(x: Array, upwards: Array, scale: Array, size: float) -> Array:
-        """The volume a step further up a gradient, within its bounds."""
+        """Return the volume a step further along a gradient, within its bounds."""
         found = np.divide(x + lift, scale, out=np.zeros_like(x), where=loop.visible)
         found *= np.float32(size)
         found *= upwards

@@ -9,10 +9,9 @@ from ..arrays import Array, ArrayLike, Integers
 from ..errors import InputError, warn
 from ..geometry.frames import affine_matrix
 from ..geometry.grid import Grid
-from ..geometry.system import PinholeSystem
 from ..memory import require
 from ..progress import Progress
-from ..projector import Emission, Projector
+from ..projector import Projector
 from ..validation import instance, real_array, shape_text
 from .loop import Loop, plain
 from .priors import Prior, penalty_of
@@ -33,7 +32,7 @@ class CountData:
 
     @classmethod
     def of(cls, method: str, A: Projector, counts: ArrayLike, background: ArrayLike = 0.0) -> "CountData":
-        """Checked: `A` is of emission; counts and background are at least 0, of the projector's shape.
+        """Check `A`, counts and background, and return them as data: counts and background >= 0, of the shape of the images.
 
         The background is one number, one for each module (M,), or images; that of the projector's model is added to it.
         Raises InputError. Pixels that are dead in the model are left out.
@@ -55,19 +54,19 @@ class CountData:
             both = f"{extra.mean():.3g} counts a pixel, besides the {known.mean():.3g} of the projector's model"
             warn(f"background: {both}: both are expected; leave one out if they are the same", 4)
         data = cls(measured, extra + known).living(A)
-        if isinstance(A.model, Emission) and len(A.views) > 3:  # two or three say too little
-            _warn_if_reversed(A, A.model.system, data)
+        if A.model.has_times and len(A.views) > 3:  # two or three say too little
+            _warn_if_reversed(A, data)
         return data
 
     def living(self, A: Projector) -> "CountData":
-        """The same data, with nothing in pixels that are dead in a projector's model: they then say nothing."""
+        """Return the data with nothing in the pixels that are dead in a projector's model, which then say nothing."""
         return CountData(*(np.where(A.living, data, np.float32(0)) for data in (self.counts, self.background)))
 
     def __getitem__(self, which: Integers) -> "CountData":
         return CountData(self.counts[which], self.background[which])
 
     def ratio(self, images: Array) -> Array:
-        """Measured by expected counts, where a volume's are `images`; 0 where neither is above 0.
+        """Return ``counts / (images + background)`` (M, n_v, n_u) for a volume with the expected counts `images`.
 
         A pixel that counted something which nothing can have caused is left out: it says nothing about the volume.
         """
@@ -75,7 +74,7 @@ class CountData:
         return np.divide(self.counts, expected, out=np.zeros_like(expected), where=expected > LEAST)
 
     def log_likelihood(self, images: Array) -> float:
-        """The log-likelihood (Poisson) of a volume with the images `images`, without the terms that no volume changes.
+        """Return ``sum(counts log(e) - e)``, e = images + background: the Poisson log-likelihood but for a constant.
 
         Pixels with counts that nothing can have caused are left out, as in `ratio`.
         """
@@ -134,14 +133,14 @@ class CountLoop(Loop):
         self.last = -np.inf  # its objective
 
     def images(self, s: int, values: Array, progress: Progress | None) -> Array:
-        """The images of a volume in subset `s`: known where it is what the last step gave."""
+        """Return the images of a volume in subset `s`; those of the last iteration's volume are not computed again."""
         part, _ = self.parts[s]
         if values is self.values and self._images is not None:
             return self._images[part.which]
         return np.asarray(part(values, progress))
 
     def objective(self, values: Array, progress: Progress | None) -> float:
-        """The log-likelihood of a volume, less the prior's penalty."""
+        """Return the log-likelihood of a volume minus the prior's penalty."""
         images: Array = self._A(values, progress)
         likelihood = self.data.log_likelihood(images)
         self._images = images
@@ -149,25 +148,19 @@ class CountLoop(Loop):
         return self.last
 
     def record(self) -> dict[str, Any]:
-        """The number of subsets, totals, counts that one unit of activity in all voxels gives, and the prior."""
+        """Return the number of subsets, the sums of counts, background and sensitivity, and the prior's settings."""
         sums = {"counts": self.data.counts, "background": self.data.background, "sensitivity": self.total}
         known = {name: float(numbers.sum(dtype=float)) for name, numbers in sums.items()}
         return {"subsets": len(self.parts), **known} | ({"prior": None} if self.prior is None else self.prior.record())
 
 
-def _coarse(model: Any) -> Emission:
-    """An ideal pinhole of few rays, with the model's times and efficiencies."""
-    own = {"time": model.effective_time, "efficiency": model.efficiency}
-    return Emission(model.system, pixel_points=1, tolerance=1e9, **own)
-
-
-def _warn_if_reversed(A: Projector, system: PinholeSystem, data: CountData) -> None:
+def _warn_if_reversed(A: Projector, data: CountData) -> None:
     """Warn where the counts are far likelier of the modules in reversed order: by a step of MLEM on few, large voxels."""
-    chosen = np.unique(np.rint(np.linspace(0, len(system) - 1, min(len(system), 16))).astype(int))  # symmetric
+    chosen = np.unique(np.rint(np.linspace(0, len(A.views) - 1, min(len(A.views), 16))).astype(int))  # symmetric
     shape = np.minimum(A.grid.shape, 20)
     step = A.grid.shape / shape
     grid = Grid(tuple(shape), A.grid.affine @ affine_matrix(np.diag(step), (step - 1) / 2))
-    B = Projector(grid, A.views[chosen], _coarse(A.model.of_views(chosen)), A.backend, A.threads)
+    B = Projector(grid, A.views[chosen], A.model.of_views(chosen).coarse(), A.backend, A.threads)
     part, seen = data[chosen], np.maximum(B.T(np.ones(B.shape_out, np.float32)), LEAST)
     total, likelihoods = float(part.counts.sum(dtype=float)), []
     even = np.full(shape, total / seen.sum(dtype=float), np.float32)

@@ -9,6 +9,7 @@ from ..errors import warn
 from ..progress import Progress, tell
 from ..projector import Projector
 from ..projector.subsets import access_order
+from .arguments import argument
 from .counts import LEAST, CountLoop
 from .loop import IterativeOptions, waiting
 from .priors import Prior
@@ -17,9 +18,17 @@ from .result import Reconstruction
 _LEAST_SHARE = 0.1
 """A prior leaves at least this share of the sensitivity everywhere."""
 _TOO_LATE = 0.05
-"""Where a prior goes below it in a larger share of the voxels, volumes swing from iteration to iteration."""
+"""Factor of the one-step-late update below which, in a larger share of voxels, volumes swing between iterations."""
 
 
+@argument("iterations", int, "How often all images are used", "what suits the method", least=1, slider=100)
+@argument(
+    "background",
+    float,
+    "Counts expected in each pixel besides those of the volume, such as scatter",
+    least=0,
+    slider=100,
+)
 def mlem(
     A: Projector,
     counts: ArrayLike,
@@ -29,7 +38,7 @@ def mlem(
     prior: Prior | None = None,
     **named: Unpack[IterativeOptions],
 ) -> Reconstruction:
-    """The activity for which the counts are most likely, by MLEM: ``x <- x / A.T(1) * A.T(counts / (A x + background))``.
+    """Reconstruct the activity of maximum likelihood (MLEM): ``x <- x / A.T(1) * A.T(counts / (A x + background))``.
 
     Parameters
     ----------
@@ -73,6 +82,8 @@ def mlem(
     return _em(CountLoop("MLEM", A, counts, iterations, 1, prior, background, *options, **named))
 
 
+@argument("subsets", int, "Of the modules: each of an iteration's updates uses one of them",
+          "about a fifth of the modules' number", least=1, slider=80)  # fmt: skip
 def osem(
     A: Projector,
     counts: ArrayLike,
@@ -83,7 +94,7 @@ def osem(
     *options: Any,
     **named: Unpack[IterativeOptions],
 ) -> Reconstruction:
-    """The activity for which the counts are most likely, by updates for each subset of the views (OSEM).
+    """Reconstruct the activity of approximately maximum likelihood by an MLEM update for each subset of the views (OSEM).
 
     It is faster than `mlem`, whose parameters it takes, by about the number of subsets at first; it ends beside the maximum
     of the likelihood, which may fall. `subsets` is by default about a fifth of the views' number, so that each sees the

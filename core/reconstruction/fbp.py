@@ -22,7 +22,7 @@ def fbp(
     *,
     quantity: str | None = None,
 ) -> Volume:
-    """The volume whose line integrals are `images`, by filtered backprojection of parallel views.
+    """Reconstruct the volume whose line integrals are `images` by filtered backprojection of parallel views.
 
     Parameters
     ----------

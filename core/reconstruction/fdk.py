@@ -28,7 +28,7 @@ def fdk(
     *,
     quantity: str | None = None,
 ) -> Volume:
-    """The volume whose line integrals are `images`, by Feldkamp's algorithm for any flat detectors and sources on a circle.
+    """Reconstruct the volume whose line integrals are `images`, by Feldkamp's algorithm for sources on a circle.
 
     Every view is taken as its own source, detector and pixel steps say, so that an orbit and detectors that are not quite
     where they should be need no correction: they are the projection matrices. The circle may lie in any plane.
@@ -112,7 +112,7 @@ class _Orbit:
 
     @classmethod
     def of(cls, views: Views) -> "_Orbit":
-        """The best circle through the sources. Raises InputError where they are too far from it, or too few."""
+        """Return the best circle through the sources; raise InputError where they are too few, or too far from it."""
         if len(views) < 3:
             raise InputError(f"fdk: expected three views or more, got {len(views)}")
         sources = views.sources
@@ -144,12 +144,12 @@ class _Orbit:
         return cls(axis, towards, angles + first_share, steps, arc)
 
     def fan_angles(self, m: int, rays: Array) -> Array:
-        """Angles (N,) in the plane between view m's rays and its ray to the centre, growing with the source's angle."""
+        """Return the in-plane angles (N,) of view m's rays from its central ray; they grow with the source's angle."""
         inward, sideways = -self.towards[m], np.cross(self.axis, self.towards[m])
         return np.arctan2(rays @ sideways, rays @ inward)
 
     def reach(self, views: Views) -> tuple[tuple[float, float] | None, float]:
-        """Arc and half the fan's angle that share the weights of rays measured twice, and what is missing of the arc.
+        """Return the arc and half the fan's angle that share the weights of rays measured twice, and what the arc lacks.
 
         None for a circle, where every ray is measured twice.
         """
@@ -165,7 +165,7 @@ class _Orbit:
 
 
 def _parker(angle: float, fan: Array, arc: float, half_fan: float) -> Array:
-    """Weights of rays by their source's angle on the arc, and their fan angles: those of the same line sum to 1.
+    """Return the weights of rays by the source's angle on the arc and their fan angles: weights of the same line sum to 1.
 
     The line of (angle, fan) is that of (angle + pi - 2 fan, -fan), so that one is measured again as long as both lie within
     the arc. An arc longer than necessary is shared as if the fan were as much wider.

@@ -1,4 +1,4 @@
-"""What FBP and FDK have in common: images weighted, filtered row by row, and backprojected."""
+"""Filtered backprojection shared by FBP and FDK: weight the images, filter them row by row, and backproject them."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -37,7 +37,7 @@ _MOST_TILT = np.radians(15)
 
 
 def checked_images(images: ArrayLike, quantity: str | None, views: Views, grid: Grid, name: str) -> tuple[Array, str]:
-    """`images` as float32 and their volume's quantity, or `InputError`, also where views or grid are none, or too few."""
+    """Return `images` as float32 (M, n_v, n_u) and the quantity of the volume to reconstruct."""
     quantity = str(quantity or getattr(images, "quantity", "mu"))
     instance(views, Views, f"{name}: views")
     instance(grid, Grid, f"{name}: grid")
@@ -47,7 +47,7 @@ def checked_images(images: ArrayLike, quantity: str | None, views: Views, grid: 
 
 
 def rows_across(images: Array, views: Views, axis: Array, name: str) -> tuple[Array, Views]:
-    """Images and views whose rows lie about in the plane across `axis`: as they are, or rows and columns exchanged.
+    """Return images and views whose rows lie about in the plane normal to `axis` (3,), rows and columns swapped if needed.
 
     Warns where the images do not fall to about 0 at their edge columns.
     """
@@ -88,7 +88,7 @@ def filtered_backprojection(
     weights: Callable[[int], Array | float],
     progress: Progress | None = None,
 ) -> Array:
-    """The sum over views of ``(images * weights(m))`` filtered along rows, at the voxels' places, by depth^2; float32."""
+    """Return the sum over views of the filtered images ``images[m] * weights(m)`` at the voxels, divided by depth^2."""
     n, (n_v, n_u) = len(images), views.shape
     matrices = views.projection_matrices()
     beyond = _columns_beyond(matrices, grid, n_u)
@@ -118,7 +118,7 @@ def filtered_backprojection(
 
 
 def _columns_beyond(matrices: Array, grid: Grid, n_u: int) -> int:
-    """Columns by which voxels lie beside the images, at most as many as these have.
+    """Return the number of columns by which voxels lie beside the images, at most as many as the images have.
 
     There filtered images are not 0, and an object that lies within the images has values around it that cancel out.
     """
@@ -130,7 +130,7 @@ def _columns_beyond(matrices: Array, grid: Grid, n_u: int) -> int:
 
 
 def angular_weights(angles: Array, turn: float) -> tuple[Array, float, float]:
-    """How much of a circle of circumference `turn` each angle stands for (M,): half the way to both neighbours.
+    """Return the angular weights (M,) of views on a circle of circumference `turn`, the first angle, and the gap.
 
     Equal angles share alike what one of them would stand for. Then the first angle after the largest gap, and that gap, if
     there is one: a gap that is large and far larger than most of the others is an end and a beginning, and not half of it is

@@ -9,6 +9,7 @@ from ..errors import InputError, warn
 from ..progress import Progress, tell
 from ..projector import Projector
 from ..validation import instance, positive, real_array
+from .arguments import argument
 from .loop import IterativeOptions, Loop, plain, waiting
 from .result import Reconstruction
 
@@ -19,6 +20,8 @@ _DONE = 1e-6
 _LEANS = "CGLS: from iteration {} on rounding puts its volumes up to a few percent beside those of exact numbers"
 
 
+@argument("relaxation", float, "Length of the steps, less than 2", above=0, slider=1.9)
+@argument("nonnegative", bool, "Values below 0 become 0")
 def sirt(
     A: Projector,
     images: ArrayLike,
@@ -28,7 +31,7 @@ def sirt(
     *options: Any,
     **named: Unpack[IterativeOptions],
 ) -> Reconstruction:
-    """The volume whose images are nearest to `images`, by SIRT: ``x <- x + relaxation C A.T(R (images - A x))``.
+    """Reconstruct a volume by weighted least squares with SIRT: ``x <- x + relaxation C A.T(R (images - A x))``.
 
     R is 1 by the pixels' sums of weights, ``A(1)``, C 1 by the voxels', ``A.T(1)``. Early iterations are smooth, later ones
     sharper and noisier. Slow and steady; for any projector.
@@ -89,7 +92,7 @@ def sirt(
 def cgls(
     A: Projector, images: ArrayLike, iterations: int = 10, *options: Any, **named: Unpack[IterativeOptions]
 ) -> Reconstruction:
-    """The volume whose images are nearest to `images`, by conjugate gradients on the normal equations (CGLS).
+    """Reconstruct a volume by least squares with conjugate gradients on the normal equations (CGLS).
 
     The fastest way to the least squares, whose values may be negative. It ends early where there is noise: about 5 to 20
     iterations are as sharp as hundreds of `sirt`.
@@ -195,27 +198,27 @@ class LeastSquaresLoop(Loop):
         self.weights: Array = self.mask.astype(np.float32)
 
     def record(self) -> dict[str, Any]:
-        """The model, and sums of views, images and mask that depend on their order."""
+        """Return the model's name, and weighted sums of views, images and mask, which change with the order of the views."""
         all_of = {"views": self._A.views.projection_matrices(), "images": self.images, "mask": self.weights}
         sums = {name: numbers.sum(axis=(1, 2), dtype=float) for name, numbers in all_of.items()}
         known = {name: float(of_each @ np.linspace(1.0, 2.0, len(of_each))) for name, of_each in sums.items()}
         return {"model": self._A.model.name, **known}
 
     def forward(self, x: Array, progress: Progress | None) -> Array:
-        """``A x``, float32."""
+        """Return ``A x``, float32 (M, n_v, n_u)."""
         return np.asarray(self._A(x, progress), np.float32)
 
     def adjoint(self, y: Array, progress: Progress | None) -> Array:
-        """``A.T y`` inside the mask, float32."""
+        """Return ``A.T y`` inside the mask and 0 outside, float32 (n_x, n_y, n_z)."""
         return np.asarray(self._A.T(y, progress), np.float32) * self.weights
 
     def bounded(self, x: Array) -> Array:
-        """`x`, at least 0 where no negative values are wanted."""
+        """Return ``max(x, 0)`` if the method allows no negative values, otherwise `x`."""
         return np.maximum(x, np.float32(0)) if self._nonnegative else x
 
 
 def inverse(sums: Array) -> Array:
-    """1 divided by sums of weights; 0 where there are none, or next to none beside the others."""
+    """Return 1 divided by sums of weights; 0 where these are 0, or negligible beside the largest."""
     least = 1e-6 * sums.max(initial=0.0)
     return np.divide(1, sums, out=np.zeros_like(sums), where=sums > least)
 

@@ -19,7 +19,7 @@ from .stopping import StoppingRule, StopWhen, inside
 Start = Volume | Reconstruction | ArrayLike | None
 
 Step = Callable[[int, Array, Progress | None], tuple[Array, float]]
-"""One iteration: ``values, objective = step(number, values, progress)``.
+"""Function that does one iteration: ``new_values, objective = step(number, values, progress)``.
 
 `number` counts from 0, those before a resume included. The values given are read-only, those returned new. `progress` is the
 iteration's own: call it as ``progress(done, total)``, the last time with done = total.
@@ -143,15 +143,15 @@ class Loop:
         return len(self._objective)
 
     def preparing(self) -> Progress | None:
-        """The progress callback for what is prepared before the first iteration: it only asks whether to go on."""
+        """Return the progress callback for the work before the first iteration, during which the progress stays at 0."""
         return waiting(self._progress, 0, self._iterations)
 
     def record(self) -> dict[str, Any]:
-        """What the data are known by when a reconstruction is resumed: entries of its settings."""
+        """Return numbers that identify the data, as settings: a resumed reconstruction must have the same numbers."""
         return {}
 
     def objective(self, values: Array, progress: Progress | None) -> float | None:
-        """The objective of any volume, if a method can say it without a step."""
+        """Return the objective of a volume, or None if the method cannot compute it without a step."""
         return None
 
     def run(self, step: Step, **settings: Any) -> Reconstruction:
@@ -213,15 +213,15 @@ class Loop:
 
 
 def _same(one: Any, other: Any) -> bool:
-    """Whether settings are equal, numbers but for the rounding by which backends differ."""
+    """Return whether settings are equal; numbers may differ by the rounding of backends."""
     return bool(one == other) or (type(one) is type(other) is float and math.isclose(one, other, rel_tol=1e-7))
 
 
 def waiting(progress: Progress | None, done: int, total: int) -> Progress | None:
-    """The progress callback of a part of a step: it says again how far the whole is, so that the part can be cancelled."""
+    """Return the progress callback of a part of a step: it repeats the progress of the whole, and can cancel."""
     return None if progress is None else lambda *_: progress(done, total)
 
 
 def plain(numbers: Any) -> Any:
-    """A torch tensor, on any device, as a numpy array; anything else as it is."""
+    """Return a torch tensor on any device as a numpy array, and anything else unchanged."""
     return to_numpy(numbers, None) if is_tensor(numbers) else numbers

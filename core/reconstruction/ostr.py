@@ -10,12 +10,14 @@ from ..progress import Progress, tell
 from ..projector import Projector
 from ..projector.subsets import access_order
 from ..validation import real_array
+from .arguments import argument
 from .least_squares import LeastSquaresLoop, inverse
 from .loop import IterativeOptions, plain, waiting
 from .priors import Prior, penalty_of
 from .result import Reconstruction
 
 
+@argument("photons", float, "Of a pixel where nothing is between", "those of the run, or 1", above=0)
 def ostr(
     A: Projector,
     images: ArrayLike,
@@ -27,7 +29,7 @@ def ostr(
     *options: Any,
     **named: Unpack[IterativeOptions],
 ) -> Reconstruction:
-    """The attenuation for which the photons that pass are most likely, less the penalty of a prior (OSTR).
+    """Reconstruct the attenuation that maximises ``log-likelihood - prior`` of the transmitted photons (OSTR).
 
     Counts are Poisson-distributed, so a ray counts as much as photons pass on it, which `sirt` and `tv` do not know. Each
     update is a step for a subset of the views, ``x <- x + (A.T(passed - counts) - p' / n) / (A.T(A(1) c) + 2 p'' / n)``,

@@ -1,6 +1,6 @@
 """Priors: penalties of differences between neighbouring voxels, for reconstructions with noise."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import KW_ONLY, dataclass, fields
 from itertools import product
 from typing import Any, Literal
@@ -15,6 +15,7 @@ from ..rays.lattices import same_lattice
 from ..rays.parallel import run_all, thread_count
 from ..validation import at_least_0, instance, one_of, positive, whole_number
 from ..volumes.volume import Volume
+from .arguments import Choice, argument
 
 # Voxels that are worked on at once: their numbers and some arrays as large stay in a core's cache.
 _SLAB_VOXELS = 2**14
@@ -43,6 +44,8 @@ class Pairs:
         return weight if self.share is None else self.share * np.float32(weight / 2)
 
 
+@argument("weight", float, "How much the penalty counts beside the data", above=0, slider=1)
+@argument("anatomy", str, "Volume across whose edges differences are not penalised, such as a CT", is_path=True)
 @dataclass(frozen=True, eq=False)
 class Prior:
     """A penalty ``weight * sum over pairs of neighbours of w_jk psi(x_j, x_k)``; `psi` is the subclass's.
@@ -92,11 +95,11 @@ class Prior:
             raise InputError(f"prior: similar: expected at most the {self.neighbors} neighbors, got {self.similar}")
 
     def on(self, grid: Grid, inside: Bools | None = None) -> "Penalty":
-        """The penalty of a volume on a grid, of pairs of voxels `inside`. Raises InputError where `anatomy` has another."""
+        """Return the penalty of pairs of voxels `inside` on a grid; raise InputError where `anatomy` has another grid."""
         return Penalty(self, grid, inside)
 
     def record(self) -> dict[str, Any]:
-        """For a reconstruction's settings."""
+        """Return the entries of a reconstruction's settings."""
         names = [field.name for field in fields(self) if field.name not in ("anatomy", "similar")]
         known = {"prior": type(self).__name__, **{name: getattr(self, name) for name in names}}
         if self.anatomy is not None:
@@ -152,6 +155,8 @@ class Quadratic(Prior):
         return np.ones_like(a), np.ones_like(a)
 
 
+@argument("gamma", float, "How much large differences are spared", least=0, slider=10)
+@argument("edge", float, "Value below which differences count as noise", "what suits the penalty", above=0, slider=10)
 @dataclass(frozen=True, eq=False)
 class RelativeDifference(Prior):
     """Penalises differences relative to the values: ``psi = (x_j - x_k)^2 / (x_j + x_k + gamma |x_j - x_k| + edge)``.
@@ -181,7 +186,7 @@ class RelativeDifference(Prior):
         object.__setattr__(self, "edge", positive(self.edge, "prior: edge", "kBq/mL"))
 
     def _parts(self, a: Array, b: Array) -> tuple[Array, Array]:
-        """The difference, and what it is divided by."""
+        """Return the difference, and its divisor."""
         difference = a - b
         size = np.abs(difference)
         size *= self.gamma
@@ -236,7 +241,7 @@ class TotalVariation(Prior):
         object.__setattr__(self, "edge", positive(self.edge, "prior: edge", "kBq/mL"))
 
     def _sizes(self, x: Array, pairs: list[Pairs]) -> Array:
-        """Sizes of the gradient in the slab's voxels."""
+        """Return the lengths of the gradient in the slab's voxels."""
         squares = np.full(x.shape, self.edge**2, x.dtype)
         for p in pairs:
             squares[p.first] += p.squared * np.square(x[p.first] - x[p.second])
@@ -277,7 +282,7 @@ class Penalty:
         self._shares = None if prior.anatomy is None else self._similarity(prior.anatomy, grid)
 
     def value(self, x: Array) -> float:
-        """The penalty."""
+        """Return the penalty of a volume."""
         found = np.zeros(len(self._slabs()))
 
         def work(slab: tuple[int, int, int]) -> None:
@@ -288,11 +293,11 @@ class Penalty:
         return self._prior.weight * float(found.sum())
 
     def gradient(self, x: Array) -> Array:
-        """Its derivatives by the voxels' values."""
+        """Return the penalty's derivatives by the voxels' values."""
         return self._summed(self._prior._add_gradient, x)
 
     def curvature(self, x: Array) -> Array:
-        """Its second derivatives by each voxel's own value; of total variation an upper bound of them."""
+        """Return the penalty's second derivatives by each voxel's value; for total variation an upper bound."""
         return self._summed(self._prior._add_curvature, x)
 
     def _summed(self, add: Callable[[Array, list[Pairs], Array], None], x: Array) -> Array:
@@ -309,13 +314,13 @@ class Penalty:
         return out
 
     def _slabs(self) -> list[tuple[int, int, int]]:
-        """Number, first plane along x and the one after the last."""
+        """Yield number, first plane along x and the plane after the last."""
         n = self._shape[0]
         planes = max(1, _SLAB_VOXELS // (self._shape[1] * self._shape[2]))
         return [(number, first, min(first + planes, n)) for number, first in enumerate(range(0, n, planes))]
 
     def _pairs(self, first: int, end: int) -> list[Pairs]:
-        """The pairs whose first voxel is in the planes from `first` to `end`."""
+        """Return the pairs whose first voxel is in the planes from `first` to `end`."""
         found = []
         for number, step in enumerate(self._steps):
             planes = min(end, self._shape[0] - step[0]) - first
@@ -329,7 +334,7 @@ class Penalty:
         return found
 
     def _similarity(self, anatomy: Volume, grid: Grid) -> list[Bytes]:
-        """For each step and voxel, how many of it and its neighbour have chosen the other: 0, 1 or 2."""
+        """Return Bowsher weights per step and voxel: 0, 1 or 2 of the voxel and its neighbour have selected the other."""
         if not same_lattice(anatomy.grid, grid):
             raise InputError("prior: anatomy's grid is not the reconstruction's: resample it (resample(volume, grid))")
         require((len(self._steps) + 8) * grid.n_voxels, "the prior's anatomy")
@@ -352,28 +357,39 @@ class Penalty:
         return shares
 
 
+PRIORS: Mapping[str, Choice] = {
+    "quadratic": Choice("Quadratic", "Smooth everywhere, edges too", Quadratic),
+    "relative-difference": Choice("Relative Difference", "Smooth, but large differences are spared", RelativeDifference),
+    "total-variation": Choice("Total Variation", "Areas of one value with sharp edges", TotalVariation),
+}  # fmt: skip
+"""The priors by their names in recipes and on the command line."""
+
+
+@argument("prior", str, "Penalty on noise", "none", unset="None", words={
+    name: (prior.label, prior.text) for name, prior in PRIORS.items()
+})  # fmt: skip
 def penalty_of(prior: Prior | None, grid: Grid, inside: Bools) -> Penalty | None:
-    """The penalty of pairs of voxels inside; None without a prior or weight.
+    """Return the penalty of pairs of voxels inside; None without a prior or weight.
 
     Raises InputError where it is no prior, or not for the grid.
     """
     if prior is None:
         return None
     if not isinstance(prior, Prior):
-        known = "Quadratic, RelativeDifference or TotalVariation"
-        raise InputError(f"prior: expected {known}, got {type(prior).__name__}")
+        *names, last = (choice.function.__name__ for choice in PRIORS.values())
+        raise InputError(f"prior: expected {', '.join(names)} or {last}, got {type(prior).__name__}")
     penalty = prior.on(grid, inside)
     return penalty if prior.weight else None
 
 
 def _half_of_neighbors(n: int) -> list[tuple[int, int, int]]:
-    """Steps to one neighbour of each opposite pair; along x 0 or 1."""
+    """Return the steps to one neighbour of each opposite pair; along x 0 or 1."""
     steps = [step for step in product((0, 1), (-1, 0, 1), (-1, 0, 1)) if step > (0, 0, 0)]
     return [step for step in steps if n == 26 or sum(map(abs, step)) == 1]
 
 
 def _shifted(step: int) -> tuple[slice, slice]:
-    """Places along an axis that have a neighbour `step` on, and those of these neighbours."""
+    """Return the places along an axis that have a neighbour `step` on, and the places of these neighbours."""
     if step < 0:
         return slice(-step, None), slice(None, step)
     return slice(None, -step or None), slice(step, None)

@@ -15,11 +15,11 @@ WINDOWS: dict[str, Callable[[Array], Array]] = {
     "hamming": lambda f: 0.54 + 0.46 * np.cos(np.pi * f),
     "hann": lambda f: 0.5 + 0.5 * np.cos(np.pi * f),
 }
-"""What the ramp is multiplied with, by name: functions of the frequency, 1 at the Nyquist frequency."""
+"""Windows by name: functions of the frequency, in units of the Nyquist frequency, that multiply the ramp filter."""
 
 
 def ramp_matrix(n: int, window: str, beyond: int = 0) -> Array:
-    """Matrix (n, n + 2 beyond), float32: ``rows @ matrix`` are the filtered rows, going on by `beyond` <= n at both ends.
+    """Return the matrix (n, n + 2 beyond), float32, that filters rows of n pixels: ``filtered = rows @ matrix``.
 
     The linear convolution of n pixels of size 1 with the ramp's band-limited kernel: 1/4 at 0, ``-1 / (pi k)^2`` at odd k.
     As a matrix there is nothing to pad.

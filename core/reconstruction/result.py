@@ -1,4 +1,4 @@
-"""What a reconstruction gives."""
+"""Result of a reconstruction."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -18,18 +18,18 @@ class Reconstruction:
 
     volume: Volume
     objective: Floats
-    """What the method makes as large, or as small, as it can, after each iteration (n,); (0,) of a method without one."""
+    """Objective of the method after each iteration (n,); (0,) for a method without one."""
     settings: Mapping[str, Any] = field(default_factory=dict)
     """The method's name ("method"), its arguments, and why it ended ("stopped"): anything JSON can hold."""
     state: Mapping[str, Array] = field(default_factory=dict)
-    """What else the method needs to go on as if it had not ended, by name; most need the volume alone."""
+    """Further arrays, by name, with which the method can go on; most methods need the volume alone."""
 
     @property
     def iterations(self) -> int:
-        """How many iterations were done, those before it was resumed included."""
+        """Number of iterations, those before the reconstruction was resumed included."""
         return len(self.objective)
 
 
 def iterations_text(n: int) -> str:
-    """A number of iterations in words, nothing for 0."""
+    """Return a number of iterations in words; "" for 0."""
     return f"{n} iteration{'s' * (n > 1)}" if n else ""

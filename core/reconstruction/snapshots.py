@@ -33,7 +33,7 @@ class Snapshots:
     def __call__(
         self, counts: Array, after: Sequence[int], background: Array | float = 0.0, progress: Progress | None = None
     ) -> Array:
-        """The volumes (len(after), n_x, n_y, n_z) after so many iterations, in growing order.
+        """Return the volumes (len(after), n_x, n_y, n_z) after so many iterations, in growing order.
 
         Counts (M, n_v, n_u) and background, all that is expected besides the volume, are of the projector's shape, float32.
         """

@@ -17,7 +17,7 @@ class StoppingRule:
         """Raise `InputError` unless the rule fits a volume of this shape; called before the first iteration."""
 
     def reason(self, objective: Sequence[float], values: Array, seconds: float) -> str | None:
-        """Why it ends, in a word for ``settings["stopped"]``, or None.
+        """Return the reason to stop, one word for ``settings["stopped"]``, or None to go on.
 
         Parameters
         ----------
@@ -76,7 +76,7 @@ class StopWhen(StoppingRule):
             raise InputError("stop: region: expected voxels, got none")
 
     def reason(self, objective: Sequence[float], values: Array, seconds: float) -> str | None:
-        """The rule that holds after an iteration, or None."""
+        """Return the name of a rule that the volume fulfils after an iteration, or None."""
         if self.change is not None and len(objective) > 1:
             last, before = objective[-1], objective[-2]
             if abs(last - before) <= self.change * abs(last):
@@ -94,7 +94,7 @@ class StopWhen(StoppingRule):
 
 
 def inside(mask: ArrayLike, name: str, shape: tuple[int, ...]) -> Bools:
-    """`mask` as booleans of a volume's shape, or `InputError`."""
+    """Return `mask` as booleans of a volume's shape; raise `InputError` for another shape."""
     found = real_numbers(mask, name)
     if found.shape != shape or found.dtype != bool:
         got = f"{found.dtype} of {' x '.join(map(str, found.shape)) or 'no'}"

@@ -24,7 +24,7 @@ def tv(
     *options: Any,
     **named: Unpack[IterativeOptions],
 ) -> Reconstruction:
-    """The volume with the least ``||A x - images||^2 / 2 + weight TV(x)``: areas of one value with sharp edges.
+    """Reconstruct the volume that minimises ``||A x - images||^2 / 2 + weight TV(x)``: uniform areas with sharp edges.
 
     TV, the total variation, sums the size of the gradient over the voxels: the root of the squared differences to the next
     voxel along each axis, by the axis's spacing in units of the smallest. Differences count between voxels that are both in
@@ -93,18 +93,18 @@ def tv(
 
 
 def total_variation(x: Array, grid: Grid, pairs: Array | float = 1.0) -> float:
-    """Sum of the sizes of the gradient of `x`, as `tv` defines them; `pairs` (3, ...) are 0 where they do not count."""
+    """Return the total variation of `x` as `tv` defines it; `pairs` (3, ...) are 0 at differences to leave out."""
     slopes = pairs * _gradient(x.astype(np.float64), grid.spacing.min() / grid.spacing)
     return float(np.sum(np.sqrt(np.sum(slopes**2, axis=0))))
 
 
 def _gradient(x: Array, factors: Array) -> Array:
-    """Differences to the next voxel along each axis, times the axis's factor, (3, ...); 0 at the end."""
+    """Return the differences (3, ...) to the next voxel along each axis times the axis's factor; 0 in the last voxel."""
     ends = [np.take(x, [-1], axis) for axis in range(3)]
     return np.stack([f * np.diff(x, axis=axis, append=ends[axis]) for axis, f in enumerate(factors)])
 
 
 def _gradient_adjoint(slopes: Array, factors: Array) -> Array:
-    """The adjoint of `_gradient`."""
+    """Return the adjoint of `_gradient` applied to `slopes` (3, n_x, n_y, n_z), an array (n_x, n_y, n_z)."""
     inner = [np.delete(slopes[axis], -1, axis) for axis in range(3)]
     return -sum(f * np.diff(inner[axis], axis=axis, prepend=0, append=0) for axis, f in enumerate(factors))

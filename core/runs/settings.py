@@ -7,168 +7,35 @@ same name in the model's class.
 
 import dataclasses
 import functools
-import operator
-from collections.abc import Collection, Iterable, Mapping
-from contextlib import suppress
-from inspect import Parameter
-from numbers import Integral, Real
-from pathlib import Path
+from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Any
 
-from ..errors import InputError
-from ..phantoms.kinds import KINDS, PhantomKind
+from ..phantoms.kinds import KINDS
 from ..phantoms.settings import setting_names
 from ..physics.isotopes import ISOTOPES
 from ..physics.materials import APERTURES, CRYSTALS
+from ..physics.noise import NOISE_MODELS
 from ..rays.backends import BACKENDS, OLD_NAMES
-from ..reconstruction.methods import METHOD_FILES, METHODS, PRIORS
-from ..validation import real_array
+from ..recipes.settings import (
+    Setting,
+    UncheckedSetting,
+    alternatives,
+    choice_setting,
+    default_setting,
+    table_names,
+    word_labels,
+)
+from ..reconstruction.method_files import METHOD_FILES
+from ..reconstruction.methods import METHODS, argument_settings
 from ..volumes.volume import LINE_INTEGRALS
 from .frame_files import RAW_TYPES
 from .orientations import ORIENTATIONS
 
-Words = Mapping[str, tuple[str, str]]
-"""The words that a setting may be, each with its label and description."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Setting:
-    """One setting of a run.
-
-    Its `needs` are conditions without which it has no effect, each alternatives such as ``"model.aperture_mu or
-    model.within_cone"``: a setting that must be given, have one value (``key=value``; a file's name may mean it), or not be
-    given (``no key``).
-    """
-
-    key: str  # table and name: "model.time"
-    kind: type  # of its value, or of each of several: bool, int, float, str; list for a 4 x 4 matrix
-    default: Any  # None: none
-    text: str  # what it is, for help texts
-    absent: str = ""  # what it means that none is given, where the default is None
-    unit: str = ""  # such as "mm"
-    words: Words = dataclasses.field(default_factory=dict)  # that it may be, beside numbers if its kind is a number
-    least: float | None = None
-    above: float | None = None  # it must exceed this
-    most: float | None = None
-    slider: float | None = None  # the largest value that a slider reaches
-    sizes: tuple[int, ...] | None = None  # how many values it may have, () for any number; None: one value alone
-    of_modules: bool = False  # whether it may be a list, or a text such as "10, 20", of one for each module
-    is_path: bool = False  # whether it names a file
-    endings: Collection[str] = ()  # in lower case, of files that it may name beside its words
-    needs: tuple[str, ...] = ()
-    option: str = ""  # on the command line; by default made from the key, like the next
-    label: str = ""  # in Blender
-    unset: str = "Auto"  # what Blender's panels show of a number that is not given
-
-    def __post_init__(self) -> None:
-        name = self.key.rpartition(".")[2].removesuffix("_degrees")
-        object.__setattr__(self, "option", self.option or "--" + name.replace("_", "-"))
-        object.__setattr__(self, "label", self.label or name.replace("_", " ").title())
-
-    def names_file(self, value: Any) -> bool:
-        """Whether a value is a file's name."""
-        if self.of_modules and isinstance(value, tuple):
-            return False
-        return self.is_path or (isinstance(value, str) and Path(value).suffix.lower() in self.endings)
-
-    @property
-    def help(self) -> str:
-        """The text with unit, words and what leaving it out means."""
-        words = f"one of {', '.join(self.words)}" if self.words else ""
-        text = ", ".join(filter(None, (self.text, self.unit, words)))
-        return text + (f"; without it, {self.absent}" if self.absent else "")
-
-    @property
-    def expected(self) -> str:
-        """What one value must be, for messages."""
-        files = f"a file ({', '.join(self.endings)})" if self.endings else ""
-        words = " or ".join(filter(None, (f"one of {', '.join(self.words)}" if self.words else "", files)))
-        if self.kind in (bool, str):
-            return words or {bool: "true or false", str: "a text"}[self.kind]
-        number = "a whole number" if self.kind is int else "a number"
-        bounds = {"of {:g} or more": self.least, "above {:g}": self.above, "and at most {:g}": self.most}
-        number += "".join(" " + text.format(bound) for text, bound in bounds.items() if bound is not None)
-        return " or ".join(filter(None, (words, number + (f" ({self.unit})" if self.unit else ""))))
-
-    def checked(self, value: Any) -> Any:
-        """`value` as a recipe keeps it, lists as tuples; `InputError` where it is not what is expected."""
-        if self.kind is list:
-            return tuple(map(tuple, real_array(value, self.key, (4, 4)).tolist()))
-        if self.of_modules:
-            return self._of_modules(value)
-        if self.sizes is None:
-            return self._one(value)
-        values = value if isinstance(value, list | tuple) else [value]
-        if not values or (self.sizes and len(values) not in self.sizes):
-            count = " or ".join(map(str, self.sizes)) or "1 or more"
-            raise InputError(f"{self.key}: expected {count} values, got {len(values)}")
-        return tuple(map(self._one, values))
-
-    def _of_modules(self, value: Any) -> Any:
-        if isinstance(value, str) and not self.names_file(value):
-            with suppress(ValueError):
-                value = list(map(float, value.replace(",", " ").split()))
-        if not isinstance(value, list | tuple):
-            return self._one(value)
-        values = tuple(self._one(one) for one in value)
-        if not values or any(isinstance(one, str) for one in values):
-            raise InputError(f"{self.key}: expected {self.expected}, or a number for each module, got {value!r:.60}")
-        return values if len(values) > 1 else values[0]
-
-    def _one(self, value: Any) -> Any:
-        if isinstance(value, str):
-            if self.key == "compute.backend":
-                value = OLD_NAMES.get(value, value)
-            known = self.words or self.endings
-            good = value in self.words or self.names_file(value) if known else self.kind is str
-        elif self.kind in (bool, str):
-            good = isinstance(value, self.kind)
-        else:
-            bounds = ((self.least, operator.ge), (self.above, operator.gt), (self.most, operator.le))
-            good = isinstance(value, Integral if self.kind is int else Real) and not isinstance(value, bool)
-            good = good and abs(value) < 1e308 and all(b is None or holds(value, b) for b, holds in bounds)
-            value = self.kind(value) if good else value
-        if not good:
-            raise InputError(f"{self.key}: expected {self.expected}, got {value!r}")
-        return value
-
-
-@dataclasses.dataclass(frozen=True)
-class OwnSetting(Setting):
-    """A setting of one kind of phantoms, whose class checks its values."""
-
-    def checked(self, value: Any) -> Any:
-        """`value` as a recipe keeps it, lists as tuples."""
-        value = value.tolist() if hasattr(value, "tolist") else value
-        return tuple(value) if isinstance(value, list) else value
-
-
-def own_settings(kind: PhantomKind, row: type[Setting] = OwnSetting, **common: Any) -> list[Setting]:
-    """The settings of a kind of phantoms, as rows of a class; `common` is what all of them have."""
-    fields = {field.name: field for field in dataclasses.fields(kind.phantom)}
-    found = []
-    for key, name in setting_names(kind.phantom).items():
-        default: Any = kind.usual.get(name, fields[name].default)
-        one, sizes = (default[0], ()) if isinstance(default, tuple) else (default, None)
-        found.append(row(key, type(one), default, fields[name].metadata.get("text", ""), sizes=sizes, **common))
-    return found
-
-
-def named(names: Iterable[str], text: str = "") -> Words:
-    """Words that label themselves, described alike."""
-    return {name: (name[0].upper() + name[1:], text) for name in names}
-
-
-def _alternatives(key: str, words: Iterable[str]) -> str:
-    """The condition that a setting has one of these values."""
-    return " or ".join(f"{key}={word}" for word in words)
-
-
 _COUNTS = "model.kind=emission"
 _XRAYS = "model.kind=spectral"
 _PHOTONS = f"{_COUNTS} or {_XRAYS}"
-_METHOD_OF_COUNTS = _alternatives("reconstruction.method", [name for name, m in METHODS.items() if m.of_counts])
+_METHOD_OF_COUNTS = alternatives("reconstruction.method", [name for name, m in METHODS.items() if m.of_counts])
 _RAYS = "model.kind=transmission or model.hole=rays or model.hole=point"
 _FILE = "volume.file or volume.states"
 _MADE = "no counts.files"
@@ -178,29 +45,16 @@ _PHANTOM_NUMBER = (*_PHANTOM, "no phantom.file", "no phantom.text")
 _NO_PHANTOM = ("no phantom.kind", "no phantom.file", "no phantom.text")
 _SERIES = "The DICOM series with this number, description or UID, where the folder holds several"
 _AT_ENERGY = "Convert CT numbers to attenuation (1/mm) at this energy, or at an isotope's strongest line"
-_ISOTOPES = named(ISOTOPES, "Energy window 10 % around its strongest line")
+_ISOTOPES = word_labels(ISOTOPES, "Energy window 10 % around its strongest line")
 _BY_NAME = "As it attenuates the isotope's photons"
 
 
 _OF_MODULES = ", one number or one for each module that is used"
-
-
-def _argument(name: str, kind: type, text: str, absent: str = "", **more: Any) -> Setting:
-    """The setting of an argument of priors or methods, with their default, which has an effect where one takes it.
-
-    Where the defaults differ the setting has none, and its help lists them.
-    """
-    needs: list[str] = []
-    defaults: dict[str, Any] = {}
-    for key, choices in (("reconstruction.prior", PRIORS), ("reconstruction.method", METHODS)):
-        takers = {word: choice for word, choice in choices.items() if name in choice.own}
-        needs += [_alternatives(key, takers)] if takers else []
-        defaults |= {choice.label: choice.own[name] for choice in takers.values()}
-    known = set(defaults.values()) - {None, Parameter.empty}
-    if len(known) > 1:
-        absent += ": " + ", ".join(f"{label} {default:g}" for label, default in defaults.items())
-    default = known.pop() if len(known) == 1 else None
-    return Setting(f"reconstruction.{name}", kind, default, text, absent, needs=(" or ".join(needs),), **more)
+_ARGUMENTS = argument_settings((
+    *("background", "relaxation", "step_decay", "photons", "nonnegative"),
+    *("prior", "weight", "gamma", "edge", "anatomy"),
+))  # fmt: skip
+"""Settings of the arguments of methods and priors, in the order of panels and recipe files; new arguments follow."""
 
 
 _DECLARED = (
@@ -217,7 +71,7 @@ _DECLARED = (
     Setting("volume.state", str, None, "State of the object's sequence", needs=("volume.object",)),
     Setting("volume.series", str, None, _SERIES, needs=("volume.file",)),
     Setting("volume.quantity", str, None, "What the values of the volume are", "what the file says; a file that says "
-            "nothing holds activity for counts, mu for photons, else CT numbers", words=named(LINE_INTEGRALS, ""),
+            "nothing holds activity for counts, mu for photons, else CT numbers", words=word_labels(LINE_INTEGRALS, ""),
             needs=(_FILE, "no volume.energy")),
     Setting("volume.energy", float, None, f"{_AT_ENERGY}; of spectral, at which the volume's mu holds", unit="keV",
             words=_ISOTOPES, above=0, needs=(f"{_FILE} or {_XRAYS}", "no model.kind=emission")),
@@ -264,7 +118,7 @@ _DECLARED = (
             label="Array"),
     Setting("counts.raw_shape", int, None, "Frames, rows and columns of a raw file", least=1, sizes=(3,)),
     Setting("counts.raw_type", str, None, "Type of a raw file's numbers", "the file is not raw",
-            words=named(RAW_TYPES, ""), unset="Not Said"),
+            words=word_labels(RAW_TYPES, ""), unset="Not Said"),
     Setting("counts.raw_big_endian", bool, False, "The most significant byte of a raw file's numbers comes first",
             label="Big-Endian"),
     Setting("counts.lower_frames", str, None, "Frames of the energy window below the peak's, from which scatter is "
@@ -301,14 +155,14 @@ _DECLARED = (
         "energy": ("Integrates Energy", "The energy, keV, that it absorbs"),
     }, needs=(_XRAYS,)),
     Setting("model.sensor", str, None, "Material of the panel that stops the X rays", "all are stopped",
-            words=named(("CdTe", "CZT", "silicon", "CsI")), needs=(_XRAYS,), unset="None"),
+            words=word_labels(("CdTe", "CZT", "silicon", "CsI")), needs=(_XRAYS,), unset="None"),
     Setting("model.sensor_thickness", float, 2.0, "Its thickness", unit="mm", above=0, slider=5, needs=(_XRAYS,
             "model.sensor"), label="Sensor (mm)"),
     Setting("model.sensor_fwhm", float, 0.0, "FWHM of a panel's energy resolution", unit="keV", least=0, slider=20,
             needs=(_XRAYS, "no model.panel=energy"), label="FWHM (keV)"),
     Setting("model.materials", str, "water-bone", "What the volume consists of for X rays", words={
         "water-bone": ("Water and Bone", "As CT numbers say: up to water's 0, then more and more bone"),
-        **named(("water", "bone", "PMMA", "iodine", "aluminum", "copper"), "At the density that the volume's mu says"),
+        **word_labels(("water", "bone", "PMMA", "iodine", "aluminum", "copper"), "At the density that the volume's mu says"),
     }, needs=(_XRAYS,)),
     Setting("model.energy_fwhm", float, None, "FWHM of the detector's energy resolution at the window's line, as a share of "
             "its energy: of each line, also beside the window, a part is counted", "all photons within the window",
@@ -331,7 +185,7 @@ _DECLARED = (
             "this close to that of the whole hole", "0.1, where rays are used", above=0, slider=1,
             needs=(_COUNTS, "model.hole=rays"), label="Hole Tolerance"),
     Setting("model.aperture_mu", float, None, "Material of the aperture's edge, or its attenuation coefficient at the "
-            "photons' energy", "nothing penetrates it", unit="1/mm", words=named(APERTURES, _BY_NAME), above=0,
+            "photons' energy", "nothing penetrates it", unit="1/mm", words=word_labels(APERTURES, _BY_NAME), above=0,
             slider=10, needs=(_COUNTS,), label="Aperture", unset="None"),
     Setting("model.opening_angle_degrees", float, 90.0, "Full angle of the knife edge's cone", unit="degrees", above=0,
             most=179.9, needs=(_COUNTS, "model.aperture_mu or model.within_cone")),
@@ -345,7 +199,7 @@ _DECLARED = (
             "that pass them, or a neighbour's hole and walls, are counted", "nothing passes them", unit="mm", above=0,
             slider=20, needs=(_COUNTS, "model.aperture_mu"), label="Walls (mm)", unset="Opaque"),
     Setting("model.crystal_mu", float, None, "Material of the crystal that stops the photons, or its attenuation "
-            "coefficient at their energy", "all photons are counted", unit="1/mm", words=named(CRYSTALS, _BY_NAME),
+            "coefficient at their energy", "all photons are counted", unit="1/mm", words=word_labels(CRYSTALS, _BY_NAME),
             above=0, slider=5, needs=(_COUNTS,), label="Crystal", unset="None"),
     Setting("model.depth_layers", int, 1, "Depths in the crystal at which photons are recorded (parallax); 1: where they "
             "enter; without rays, more mean all depths", least=1, slider=8, needs=(_COUNTS, "model.crystal_mu")),
@@ -397,11 +251,11 @@ _DECLARED = (
     Setting("noise.seed", int, None, "Draw Poisson counts with this seed; of several states or frames with SEED, SEED + 1 …",
             "their expected means", least=0, most=2**64 - 1,
             needs=(f"model.photons or {_PHOTONS}", "no model.panel=energy", _MADE), option="--noise"),
+    *choice_setting("noise.model", NOISE_MODELS, "How counts vary around their means", option="--noise-model",
+                    needs=("noise.seed",)),
     Setting("reconstruction.method", str, "osem", "How the volume is found", endings=METHOD_FILES,
             words={name: (method.label, method.text) for name, method in METHODS.items()}),
-    _argument("iterations", int, "How often all images are used", "what suits the method", least=1, slider=100),
-    _argument("subsets", int, "Of the modules: each of an iteration's updates uses one of them",
-              "about a fifth of the modules' number", least=1, slider=80),
+    *(_ARGUMENTS.pop(name) for name in ("iterations", "subsets")),
     Setting("reconstruction.voxels", int, None, "Voxels along x y z, or one number for all",
             "voxels are of half the smallest rod, or of half the resolution, if 64 to 128 of them cover the ROI",
             least=1, sizes=(1, 3)),
@@ -409,7 +263,7 @@ _DECLARED = (
             above=0, slider=10, sizes=(1, 3), label="Voxel Size (mm)"),
     Setting("reconstruction.center", float, (0.0, 0.0, 0.0), "Middle of the volume, x y z", unit="mm", sizes=(3,)),
     Setting("reconstruction.allow", str, None, "What may differ from what a network was trained for",
-            words=named(("scanner", "grid", "physics")), sizes=(), needs=("reconstruction.method=FILE.pt",)),
+            words=word_labels(("scanner", "grid", "physics")), sizes=(), needs=("reconstruction.method=FILE.pt",)),
     Setting("reconstruction.hole", str, "auto", "How the hole's blur is modelled: auto is by depth, where the run's "
             "model allows it and no points are given", label="Hole's Blur", needs=(_METHOD_OF_COUNTS,), words={
         "auto": ("Automatic", "By depth, where the run's model allows it and no points are given; else by rays"),
@@ -427,18 +281,7 @@ _DECLARED = (
             needs=(_METHOD_OF_COUNTS,), label="Ignore Detector Blur"),
     Setting("reconstruction.ignore_beam_hardening", bool, False, "Take mere logarithms of X rays of many energies: no "
             "correction for water", needs=(f"no {_METHOD_OF_COUNTS}",)),
-    _argument("background", float, "Counts expected in each pixel besides those of the volume, such as scatter", least=0,
-              slider=100),
-    _argument("relaxation", float, "Length of the steps, less than 2", above=0, slider=1.9),
-    _argument("step_decay", float, "Steps are 1 / (1 + this times the number of iterations before)", least=0, slider=1),
-    _argument("photons", float, "Of a pixel where nothing is between", "those of the run, or 1", above=0),
-    _argument("nonnegative", bool, "Values below 0 become 0"),
-    _argument("prior", str, "Penalty on noise", "none",
-              words={name: (prior.label, prior.text) for name, prior in PRIORS.items()}, unset="None"),
-    _argument("weight", float, "How much the penalty counts beside the data", above=0, slider=1),
-    _argument("gamma", float, "How much large differences are spared", least=0, slider=10),
-    _argument("edge", float, "Value below which differences count as noise", "what suits the penalty", above=0, slider=10),
-    _argument("anatomy", str, "Volume across whose edges differences are not penalised, such as a CT", is_path=True),
+    *_ARGUMENTS.values(),
     Setting("reconstruction.stop_change", float, None, "End when an iteration changes the objective by less than this share "
             "of it, such as 1e-5", "all iterations are done", above=0, slider=0.01),
     Setting("reconstruction.stop_noise", float, None, "End when the standard deviation in the region is this share of its "
@@ -446,7 +289,7 @@ _DECLARED = (
     Setting("reconstruction.stop_region", float, None, "Ball of even activity in which noise is measured: x y z radius",
             unit="mm", sizes=(4,), needs=("reconstruction.stop_noise",)),
     Setting("reconstruction.stop_seconds", float, None, "End after so much time", unit="s", above=0, slider=3600),
-    Setting("compute.backend", str, "auto", "What computes the line integrals", words={
+    Setting("compute.backend", str, "auto", "What computes the line integrals", aliases=OLD_NAMES, words={
         "auto": ("Automatic", "The fastest that works here"), **{b.name: (b.label, b.text) for b in BACKENDS.values()},
     }),
     Setting("compute.threads", int, None, "Processor threads", "all", least=1, slider=64,
@@ -454,11 +297,11 @@ _DECLARED = (
 )  # fmt: skip
 
 _NEEDED = {"phantom": _PHANTOM, "counts": ("counts.files",)}
-"""What all settings of a table need, but for that which is needed itself."""
+"""Settings that all other settings of a table need, by the table's name."""
 
 
 def _with_needs(row: Setting) -> Setting:
-    """A setting that also needs what all of its table need."""
+    """Return the setting with the settings that its whole table needs, unless it is one of these itself."""
     needed = _NEEDED.get(row.key.partition(".")[0], ())
     return row if row.key in needed else dataclasses.replace(row, needs=(*needed, *row.needs))
 
@@ -467,17 +310,32 @@ SETTINGS: Mapping[str, Setting] = MappingProxyType({row.key: _with_needs(row) fo
 """Every setting by its key, table by table; `settings_with` has those of a kind of phantoms, too."""
 
 
+def phantom_settings(name: str, row: type[Setting] = UncheckedSetting, **details: Any) -> list[Setting]:
+    """Return the settings of the kind of phantom of that name, one for each field of its class, as rows of class `row`.
+
+    There are none for an unknown name. `details` are further attributes of all rows.
+    """
+    settings = []
+    for kind in KINDS:
+        fields = {field.name: field for field in dataclasses.fields(kind.phantom)} if kind.name == name else {}
+        for key, field in setting_names(kind.phantom).items() if fields else ():
+            default, text = kind.usual.get(field, fields[field].default), fields[field].metadata.get("text", "")
+            settings.append(default_setting(key, default, text, row, **details))
+    return settings
+
+
 @functools.cache
 def settings_with(kind: str) -> Mapping[str, Setting]:
-    """Every setting by its key, with those of a kind of phantoms."""
-    own = [row for known in KINDS if known.name == kind for row in own_settings(known, needs=_PHANTOM_NUMBER)]
-    return MappingProxyType({**SETTINGS, **{f"phantom.{row.key}": row for row in own}})
+    """Return every setting by its key, with those of a kind of phantom."""
+    rows = phantom_settings(kind, needs=_PHANTOM_NUMBER)
+    return MappingProxyType({**SETTINGS, **{f"phantom.{row.key}": row for row in rows}})
 
 
-TABLES = tuple(dict.fromkeys(key.partition(".")[0] for key in SETTINGS))
+TABLES = table_names(SETTINGS)
+"""Names of the tables of a recipe."""
 
 HOW_TABLES = ("reconstruction", "model", "attenuation", "compute")
-"""Those that say how a run is reconstructed. The others say how its images were made."""
+"""Tables that say how a run is reconstructed; the others say how its images were made."""
 
 SAMPLING = tuple(f"model.{name}" for name in ("aperture_points", "aperture_tolerance", "pixel_points", "tolerance"))
-"""Numbers of rays and what sets them: counts have them only where the hole is by rays."""
+"""Keys of the numbers of rays and of what sets them; counts have them only if the hole is modelled by rays."""

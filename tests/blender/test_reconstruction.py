@@ -18,9 +18,10 @@ from mphdrr.addon.reconstruction.reconstruction_properties import PROPERTIES, pa
 from mphdrr.addon.scanner import scanner
 from mphdrr.addon.volumes import slices, volumes
 from mphdrr.core.progress import Cancelled
-from mphdrr.core.reconstruction.methods import METHOD_FILES, METHODS, Method
+from mphdrr.core.reconstruction.method_files import METHOD_FILES
+from mphdrr.core.reconstruction.methods import METHODS, Method
 from mphdrr.core.runs.files import read_run
-from mphdrr.core.runs.run_recipe import truth_of_run
+from mphdrr.core.runs.run_recipe import run_truth
 from mphdrr.core.runs.settings import SETTINGS
 from mphdrr.core.volumes.sights import bright_value, full_slices
 
@@ -76,7 +77,7 @@ def test_the_volume_is_that_of_the_command_line(render, scene):
     np.testing.assert_allclose(known["objective"], expected.objective)
     assert [name for name, _ in known["scores"]] == ["NRMSE"] and known["voxels"] == "14 x 14 x 14 voxels of 7 mm"
     assert known["flatters"] == expected.settings["flatters"]
-    rods = mph.score_volume(expected.volume, *truth_of_run(run)).derenzo
+    rods = mph.score_volume(expected.volume, *run_truth(run)).derenzo
     assert [tuple(row) for row in known["rods"]] == [sector.cells for sector in rods if sector.rod_diameter]
     assert bpy.data.objects["Derenzo"].hide_get(), "the truth stands where the reconstruction is"
     planes, at = slices.planes_of(item), full_slices(expected.volume.array)

@@ -91,6 +91,11 @@ def general_grid(rng: np.random.Generator, shape: tuple[int, int, int]) -> Grid:
     return Grid(shape, affine)
 
 
+def voxel_centers(grid: Grid) -> np.ndarray:
+    """World places (n_x, n_y, n_z, 3) of a grid's voxels."""
+    return np.moveaxis(np.indices(grid.shape), 0, -1) @ grid.affine[:3, :3].T + grid.affine[:3, 3]
+
+
 def emission(system: PinholeSystem, mu: Volume | None = None, **options: Any) -> Emission:
     """Emission with one ray to each pixel's centre, for laws of single rays; without the warning that these are too few.
 

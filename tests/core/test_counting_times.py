@@ -9,7 +9,7 @@ import pytest
 
 import mphdrr.core as mph
 from mphdrr.core.recording import recorded_warnings
-from mphdrr.core.runs.mosaic import caption
+from mphdrr.core.runs.mosaic import counts_caption
 
 from . import dicom_files
 from .conftest import BACKENDS, emission, refused, warned
@@ -112,7 +112,7 @@ def test_dicoms_phases_say_when_frames_began_and_how_long_they_took(system, rng,
     run = mph.counts_run(mph.read_counts(path), system, "112-101", "back-v")
     np.testing.assert_allclose(run.recipe["model.time"], times[::-1])
     np.testing.assert_allclose(run.recipe["model.start"], begun[::-1])
-    assert "10 to 21 s" in caption(run)
+    assert "10 to 21 s" in counts_caption(run)
     recipe = mph.Recipe({
         "counts.files": [str(path)], "counts.frames": "112-101", "counts.orientation": "back-v", "model.kind": "emission",
         "model.start": 3600.0, "model.isotope": "Tc-99m",

@@ -10,8 +10,8 @@ import pytest
 
 import mphdrr.core as mph
 from mphdrr.core.events import EventMaker, EventRecipe
+from mphdrr.core.recipes.toml import toml_value
 from mphdrr.core.recording import recorded_warnings
-from mphdrr.core.toml import toml_value
 
 from .small_events import WORKBOOK
 

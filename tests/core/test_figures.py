@@ -20,7 +20,7 @@ from mphdrr.core.figures.subject import FigureSubject
 from mphdrr.core.figures.sums import orthogonal_sum
 from mphdrr.core.geometry.presets import c_arm_views
 from mphdrr.core.runs import letters
-from mphdrr.core.runs.resizing import resized
+from mphdrr.core.runs.display import resize_picture
 
 from .conftest import refused
 
@@ -160,8 +160,10 @@ def test_pixels_and_svg_show_the_same_drawing(tmp_path):
 def test_resizing_keeps_means():
     picture = np.random.default_rng(3).random((31, 47, 2))
     for shape in ((7, 10), (31, 47), (62, 94), (100, 33)):
-        np.testing.assert_allclose(resized(picture, *shape).mean(axis=(0, 1)), picture.mean(axis=(0, 1)), rtol=1e-5)
-    np.testing.assert_allclose(resized(picture, 62, 94)[::2, 1::2], picture, rtol=1e-5)
+        np.testing.assert_allclose(
+            resize_picture(picture, *shape).mean(axis=(0, 1)), picture.mean(axis=(0, 1)), rtol=1e-5
+        )
+    np.testing.assert_allclose(resize_picture(picture, 62, 94)[::2, 1::2], picture, rtol=1e-5)
 
 
 def figure(*words: object) -> int:

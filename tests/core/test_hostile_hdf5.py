@@ -15,7 +15,7 @@ import pytest
 
 import mphdrr.core as mph
 from mphdrr.core import hdf5
-from mphdrr.core.toml import read_toml
+from mphdrr.core.recipes.toml import read_toml
 from mphdrr.core.volumes.meshes.mesh import read_mesh
 
 from .conftest import refused

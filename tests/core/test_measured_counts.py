@@ -11,7 +11,7 @@ import pytest
 import mphdrr.core as mph
 from mphdrr.addon.cli import main
 from mphdrr.core.runs.comparing import difference
-from mphdrr.core.runs.mosaic import caption, labels
+from mphdrr.core.runs.mosaic import counts_caption, module_labels
 from mphdrr.core.runs.recipe import recorded_recipe
 
 from . import dicom_files
@@ -284,7 +284,7 @@ def test_frames_that_are_not_used_are_left_out(system):
     for frames in ("none,102,NONE * 2 101", [None, 102, None, None, np.int64(101)]):
         run = mph.counts_run(counts, system[:2], frames, "back-v", 3)
         np.testing.assert_array_equal(run.projections, counts[[4, 1]])
-        assert labels(run) == ["101 (5)", "102 (2)"]
+        assert module_labels(run) == ["101 (5)", "102 (2)"]
     refused(lambda: mph.counts_run(counts, system[:2], "101-102", "back-v", 3), "say none for a frame that is not used")
 
 
@@ -358,8 +358,8 @@ def test_the_command_takes_counts_for_projections(workbook, tmp_path, capsys):
         workbook.name,
         [4, 3, 2, 1],
     )
-    assert labels(made) == ["1 (4)", "2 (3)", "3 (2)", "4 (1)"]
-    assert caption(made).startswith("c.npy, 60 s, frames back-v. Module (frame): crystals seen from behind")
+    assert module_labels(made) == ["1 (4)", "2 (3)", "3 (2)", "4 (1)"]
+    assert counts_caption(made).startswith("c.npy, 60 s, frames back-v. Module (frame): crystals seen from behind")
     assert main([*command, *told, "--write-recipe", str(tmp_path / "c.toml")]) == 0
     assert main(["project", str(tmp_path / "c.toml"), "-o", str(tmp_path / "again.npz")]) == 0
     np.testing.assert_array_equal(mph.read_run(tmp_path / "again.npz").projections, made.projections)

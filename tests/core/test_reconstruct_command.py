@@ -18,9 +18,11 @@ from mphdrr.addon.cli import main
 from mphdrr.core.cli.reconstruct import settings_line
 from mphdrr.core.figures.page import DARK, Page
 from mphdrr.core.figures.reconstructions import LIGHTS, draw
-from mphdrr.core.reconstruction.methods import METHOD_FILES, METHODS, PRIORS, Method
-from mphdrr.core.runs.recipe import recipe_of_tables
-from mphdrr.core.runs.reconstructing import model_of, reconstruction_grid
+from mphdrr.core.reconstruction.method_files import METHOD_FILES
+from mphdrr.core.reconstruction.methods import METHODS, Method
+from mphdrr.core.reconstruction.priors import PRIORS
+from mphdrr.core.runs.recipe import recipe_from_tables
+from mphdrr.core.runs.reconstructing import reconstruction_grid, reconstruction_model
 from mphdrr.core.runs.settings import SETTINGS
 
 from .conftest import refused
@@ -165,7 +167,7 @@ def radiograph(scanner) -> mph.ProjectionRun:
 
 def projector(run: mph.ProjectionRun, recipe: mph.Recipe) -> mph.Projector:
     recipe = run.recipe.updated(recipe.given)
-    return mph.projector_of_run(run, reconstruction_grid(run, recipe), None, model_of(run, recipe))
+    return mph.projector_of_run(run, reconstruction_grid(run, recipe), None, reconstruction_model(run, recipe))
 
 
 @pytest.mark.long
@@ -186,7 +188,7 @@ def test_each_method_has_its_own_defaults_wherever_it_is_chosen(name, run, radio
     state, output = tmp_path / "s.h5", ["-o", tmp_path / "v.npz"]
     command(tmp_path / "run.npz", *typed, "--quiet", "--save-state", state, *output)
     by_command, by_recipe = mph.read_reconstruction(state), mph.reconstruct_run(run, recipe)
-    again = mph.reconstruct_run(run, recipe_of_tables(by_command.settings["recipe"]))
+    again = mph.reconstruct_run(run, recipe_from_tables(by_command.settings["recipe"]))
     for found in (by_command, by_recipe, again):
         np.testing.assert_array_equal(found.volume.array, expected.volume.array)
         assert expected.settings.items() <= found.settings.items()
@@ -343,7 +345,7 @@ def test_voxels_cover_the_roi_and_the_model_is_that_of_the_run(run):
 
     def model(**changes):
         recipe = run.recipe.updated({key.replace("__", "."): value for key, value in changes.items()})
-        found = model_of(run, recipe)
+        found = reconstruction_model(run, recipe)
         return found["model.hole"], found["model.aperture_points"], found["model.intrinsic_fwhm"]
 
     assert model() == ("auto", None, 1.0)  # the whole hole has no points

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 
 from ...errors import InputError
+from ...reconstruction.scores.summary import JUDGED_SCORES
 from .observer import observe
 from .rods import PRESENT
 from .statistics import difference_of_means, ratio_of_means, wilson
@@ -14,7 +15,7 @@ Rows = Sequence[Mapping[str, Any]]
 
 ENOUGH_EVENTS, ENOUGH_SITES = 50, 200
 """Numbers of events and of sites from which on intervals are reliable; rows with fewer get a note."""
-_MEANS = ("nrmse", "ssim", "contrast", "deviance", "seconds")
+_MEANS = ("nrmse", *(row.name for row in JUDGED_SCORES), "contrast", "deviance", "seconds")
 _DRAWN = ("bias", "deviation")
 
 

@@ -16,7 +16,7 @@ from .parallelproj_operator import ParallelprojOperator
 
 
 def scipy_operator(A: LinearOperator) -> Any:
-    """`A` as a ``scipy.sparse.linalg.LinearOperator`` on flat arrays, for its ``lsqr``, ``lsmr``, ``svds``, …
+    """Return `A` as a ``scipy.sparse.linalg.LinearOperator`` on flat arrays, for ``lsqr``, ``lsmr``, ``svds`` and others.
 
     Parameters
     ----------
@@ -43,7 +43,7 @@ def scipy_operator(A: LinearOperator) -> Any:
 
 
 def deepinv_physics(A: Projector, **options: Any) -> Any:
-    """`A` as a ``deepinv.physics.LinearPhysics``, for deepinv's algorithms and networks.
+    """Return `A` as a ``deepinv.physics.LinearPhysics``, for deepinv's algorithms and networks.
 
     Parameters
     ----------
@@ -79,7 +79,7 @@ def deepinv_physics(A: Projector, **options: Any) -> Any:
 
 
 def pytomography_matrix(A: Projector) -> Any:
-    """`A` as a PyTomography ``SystemMatrix``, for its OSEM, BSREM and other algorithms.
+    """Return `A` as a PyTomography ``SystemMatrix``, for its OSEM, BSREM and other algorithms.
 
     Parameters
     ----------
@@ -113,7 +113,7 @@ def pytomography_matrix(A: Projector) -> Any:
 
 
 def parallelproj_operator(A: LinearOperator) -> ParallelprojOperator:
-    """`A` with the methods of a ``parallelproj`` linear operator, for algorithms that are written for these.
+    """Return `A` with the methods of a ``parallelproj`` linear operator, for algorithms that are written for these.
 
     Parameters
     ----------
@@ -140,6 +140,6 @@ def parallelproj_operator(A: LinearOperator) -> ParallelprojOperator:
 
 
 def _module(name: str, package: str) -> Any:
-    """A module of this folder, which imports the package; `InputError` where that, or something it needs, is missing."""
+    """Import and return a module of this folder; raise `InputError` where a package that it needs is missing."""
     with needing(feature=package):
         return importlib.import_module(f".{name}", __package__)

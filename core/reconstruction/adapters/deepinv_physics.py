@@ -21,25 +21,25 @@ class ProjectorPhysics(LinearPhysics):
             self.register_buffer("background", torch.tensor(A.background, dtype=torch.float32), persistent=False)
 
     def A(self, x: Tensor, add_background: bool = False, **_: Any) -> Tensor:
-        """Images (B, C, M, n_v, n_u) of volumes, with the model's background if asked for."""
+        """Return images (B, C, M, n_v, n_u) of volumes, with the model's background if asked for."""
         images: Tensor = self.projector(x)
         if add_background and hasattr(self, "background"):
             images = images + self.background
         return images
 
     def A_adjoint(self, y: Tensor, **_: Any) -> Tensor:
-        """The exact adjoint of the linear part."""
+        """Apply the exact adjoint of the linear part."""
         return self.projector.T(y)
 
     def forward(self, x: Tensor, **options: Any) -> Tensor:
-        """Measurements: the expected counts with background, through the noise model and the sensor."""
+        """Return measurements: the expected counts with background, through the noise model and the sensor."""
         return self.sensor(self.noise(self.A(x, add_background=True, **options)))
 
     def split_physics(self, n: int) -> StackedLinearPhysics:
-        """The physics of `n` balanced subsets of the views."""
+        """Return the physics of `n` balanced subsets of the views."""
         parts = in_access_order(self.projector.subsets(n))
         return StackedLinearPhysics([ProjectorPhysics(part, noise_model=self.noise_model) for part in parts])
 
     def split_measurements(self, y: Tensor, n: int) -> TensorList:
-        """Their measurements, of those of all views (B, C, M, n_v, n_u)."""
+        """Split the measurements of all views (B, C, M, n_v, n_u) into those of `n` balanced subsets."""
         return TensorList([y[:, :, which] for which in in_access_order(balanced_subsets(self.projector.views, n))])

@@ -38,18 +38,18 @@ class ParallelprojOperator:
         return type(self)(self._operator.T, self.scale)
 
     def apply(self, x: ArrayOrTensor) -> ArrayOrTensor:
-        """``scale * A(x)``, of an array or tensor."""
+        """Return ``scale * A(x)`` of an array or tensor."""
         result = self._operator(x)
         return result if self.scale == 1 else self.scale * result
 
     __call__ = apply
 
     def adjoint(self, y: ArrayOrTensor) -> ArrayOrTensor:
-        """``scale * A.T(y)``, of an array or tensor."""
+        """Return ``scale * A.T(y)`` of an array or tensor."""
         return self.H.apply(y)
 
     def adjointness_test(self, xp: Any = np, dev: Any = None, verbose: bool = False, **tolerances: Any) -> bool:
-        """Whether <A x, y> and <x, A.T y> are close (`numpy.isclose`) for random x and y of the array library `xp`."""
+        """Return whether <A x, y> and <x, A.T y> are close (`numpy.isclose`) for random x, y of the array library `xp`."""
         x, y = (_random(shape, xp, dev) for shape in (self.in_shape, self.out_shape))
         forward, back = float(xp.sum(self.apply(x) * y)), float(xp.sum(x * self.adjoint(y)))
         if verbose:
@@ -57,7 +57,7 @@ class ParallelprojOperator:
         return bool(np.isclose(forward, back, **tolerances))
 
     def norm(self, xp: Any = np, dev: Any = None, num_iter: int = 30) -> float:
-        """The largest singular value, by power iterations."""
+        """Return the largest singular value, by power iterations."""
         x = _random(self.in_shape, xp, dev)
         squared = 0.0
         for _ in range(num_iter):

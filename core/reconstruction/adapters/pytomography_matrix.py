@@ -33,25 +33,25 @@ class ProjectorMatrix(SystemMatrix):
         self.subset_indices_array = [torch.tensor(part.which) for part in self._parts]
 
     def forward(self, object: Tensor, subset_idx: int | None = None) -> Tensor:
-        """The projections of an object, or those of a subset."""
+        """Return the projections of an object, of all views or of a subset."""
         return self._part(subset_idx)(object)
 
     def backward(self, proj: Tensor, subset_idx: int | None = None) -> Tensor:
-        """The exact adjoint, of all projections or those of a subset."""
+        """Apply the exact adjoint to all projections, or to those of a subset."""
         return self._part(subset_idx).T(proj)
 
     def get_projection_subset(self, projections: Tensor, subset_idx: int | None) -> Tensor:
-        """A subset's part of all projections."""
+        """Return the projections of a subset."""
         if subset_idx is None:
             return projections
         return projections[self.subset_indices_array[subset_idx].to(projections.device)]
 
     def get_weighting_subset(self, subset_idx: int | None) -> float:
-        """The subset's share of the views."""
+        """Return the subset's share of the views."""
         return len(self._part(subset_idx).views) / len(self.projector.views)
 
     def compute_normalization_factor(self, subset_idx: int | None = None) -> Tensor:
-        """The backprojection of ones."""
+        """Return the backprojection of ones."""
         return self.backward(torch.ones(self._part(subset_idx).shape_out, device=pytomography.device), subset_idx)
 
     def _part(self, subset_idx: int | None) -> Projector:

@@ -28,7 +28,7 @@ class ScipyOperator(ScipyLinearOperator):
 
 
 def _of_columns(A: LinearOperator, columns: Array) -> Array:
-    """`A` of each column, as one batch."""
+    """Apply `A` to each column, as one batch."""
     n = columns.shape[1]
     result: Array = A(columns.T.reshape(n, *A.shape_in))
     return result.reshape(n, -1).T

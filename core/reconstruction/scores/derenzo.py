@@ -1,7 +1,8 @@
-"""What a reconstruction resolves of a Derenzo phantom's rods, sector by sector."""
+"""Scores of the rods of a reconstructed Derenzo phantom: which are resolved, sector by sector."""
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -14,7 +15,7 @@ from ...progress import Progress, tell
 from ...validation import freeze, instance
 from ...volumes.resampling import values_at
 from ...volumes.volume import Volume, require_quantity
-from .rows import Rows, column
+from .rows import Rows, column, json_number
 
 RESOLVED_BELOW = 0.735
 """Valley-to-peak of two points that are just resolved, by Rayleigh's criterion."""
@@ -23,7 +24,7 @@ NOISE_BELOW, SEEN_BELOW = 0.001, 0.02
 """Chance that noise makes a sector's contrast: of one that is resolved, and of one that is seen, it is less."""
 
 LIGHTS = {"green": "resolved", "amber": "seen, not resolved", "red": "not resolved"}
-"""What a sector is, by the colour of its dot. Amber: its rods stand out of the noise, but not enough."""
+"""Meaning of the colours of a sector's dot. Amber: its rods stand out of the noise, but not enough."""
 
 _LENGTH = 0.5  # of the rods, around their middle, that profiles are means over: ends blur into what is beside them
 _WIDTH = 0.5  # of a rod's diameter, that profiles are means over
@@ -70,11 +71,11 @@ class DerenzoSector:
     contrast_recovery: float
     """Difference of mean peak and mean valley, by that of the phantom."""
     profiles: tuple[RodProfile, ...] = ()
-    """One for each pair of neighbours."""
+    """Profiles, one for each pair of neighbours."""
     note: str = ""
     """Why something is NaN."""
     chance: float = np.nan
-    """That noise alone makes as large a difference of mean peak and mean valley, as rods and valleys scatter."""
+    """p-value of a difference of mean peak and mean valley as large as this by noise alone, as rods and valleys scatter."""
 
     @property
     def resolved(self) -> float:
@@ -117,6 +118,23 @@ class DerenzoScore(Rows[DerenzoSector]):
     valley_to_peak = column("valley_to_peak", "Mean valley by mean peak.")
     resolved = column("resolved", "1 or 0.")
     contrast_recovery = column("contrast_recovery", "Of the phantom's contrast.")
+
+    @property
+    def lines(self) -> list[str]:
+        """The scores as lines of text, one for each sector with rods."""
+        texts = ((sector.rod_diameter, ": ".join(filter(None, (sector.light, sector.words)))) for sector in self)
+        return [f"{diameter:g} mm  {text}" for diameter, text in texts if diameter]
+
+    @property
+    def record(self) -> dict[str, Any]:
+        """The scores as JSON can hold them, None for an unknown number."""
+        names = ("rod_diameter", "valley_to_peak", "contrast_recovery", "chance", "pairs_resolved")
+        return {"derenzo": [
+            {**{name: json_number(getattr(sector, name)) for name in names}, "pairs": len(sector.profiles),
+             "note": sector.note, "light": sector.light or None,
+             "resolved": None if np.isnan(sector.resolved) else bool(sector.resolved)}
+            for sector in self
+        ]}  # fmt: skip
 
 
 def derenzo_score(
@@ -184,7 +202,7 @@ def derenzo_score(
 
 @dataclass(frozen=True, eq=False)
 class _Sector:
-    """One sector of a phantom's rods, in a volume. Places (…, 3) are in the rods' own frame, mm."""
+    """Sector of a phantom's rods in a volume. Positions (…, 3) are in the rods' own frame, mm."""
 
     volume: Volume
     phantom: Phantom
@@ -208,7 +226,7 @@ class _Sector:
         return DerenzoSector(diameter, ratio, contrast, tuple(profiles), note, self._chance(profiles))
 
     def _chance(self, profiles: list[RodProfile]) -> float:
-        """That noise makes as large a difference of rods and valleys: of Student's t."""
+        """Return the one-sided p-value of the difference of rods and valleys, by Student's t."""
         values = np.array([profile.values for profile in profiles]) * (1 if profiles[0].is_hot else -1)
         which = np.unique(self._pairs, return_inverse=True)[1].ravel()
         rods = np.bincount(which, values[:, [0, -1]].ravel()) / np.bincount(which)
@@ -221,7 +239,7 @@ class _Sector:
         return float(beyond / (2 * half))
 
     def _missing(self, diameter: float) -> str:
-        """Why the sector has no score, if that is so."""
+        """Return the reason why the sector has no score, if it has none."""
         if not len(self._centers):
             return "no rods"
         if not len(self._pairs):
@@ -272,7 +290,7 @@ class _Sector:
         return self.volume.grid.index_from_world @ self._world_from_rods
 
     def _true_values(self) -> tuple[float, float]:
-        """The phantom's values in the rods and halfway between them, means over the part of the length that counts."""
+        """Return the phantom's mean values in the rods and halfway between them, over the scored part of the length."""
         starts, ends = self._centers[self._pairs].transpose(1, 0, 2)
         low, high, _ = self._span
         along = (_middles(9) * (high - low) + (low + high) / 2)[:, None, None] * [0, 0, 1]
@@ -304,5 +322,5 @@ class _Sector:
 
 
 def _middles(count: int) -> Floats:
-    """The middles of so many equal parts of the length from -1/2 to 1/2."""
+    """Return the middles of so many equal parts of the length from -1/2 to 1/2."""
     return (np.arange(count) + 0.5) / count - 0.5

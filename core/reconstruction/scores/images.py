@@ -1,4 +1,4 @@
-"""How far a volume is from the truth, voxel by voxel: errors, similarity, contrast to noise, bias and deviation."""
+"""Differences of a volume from the truth, voxel by voxel: errors, similarity, contrast to noise, bias and deviation."""
 
 from collections.abc import Iterable
 from typing import Any, NamedTuple
@@ -16,13 +16,15 @@ from ..stopping import inside
 
 Values = Volume | ArrayLike
 
-_SIGMA, _RADIUS = 1.5, 5  # of the window of Wang et al., voxels
+_SIGMA, _RADIUS = 1.5, 5  # standard deviation and half-width, voxels, of the window of Wang et al.
+WINDOW = 2 * _RADIUS + 1
+"""Side of that window, voxels."""
 _K1, _K2 = 0.01, 0.03  # their constants
 _SLAB = 1 << 18  # voxels at once
 
 
 def nrmse(volume: Values, truth: Values, mask: ArrayLike | None = None) -> float:
-    """Normalised root mean square error: rms of volume - truth, by the rms of the truth.
+    """Return the normalised root mean square error: rms of volume - truth, divided by the rms of the truth.
 
     0 for the truth itself, 1 for a volume of zeros. This normalisation, by the truth's Euclidean norm, is one of several in
     use (Fienup 1997, "Invariant error metrics for image reconstruction", Appl. Opt. 36(32)).
@@ -48,7 +50,7 @@ def nrmse(volume: Values, truth: Values, mask: ArrayLike | None = None) -> float
 
 
 def psnr(volume: Values, truth: Values, data_range: float | None = None, mask: ArrayLike | None = None) -> float:
-    """Peak signal-to-noise ratio, dB: 20 log10(range / rms of volume - truth).
+    """Return the peak signal-to-noise ratio, dB: 20 log10(range / rms of volume - truth).
 
     Infinite for the truth itself. (Huynh-Thu, Ghanbari 2008, "Scope of validity of PSNR in image/video quality assessment",
     Electron. Lett. 44(13).)
@@ -67,7 +69,7 @@ def psnr(volume: Values, truth: Values, data_range: float | None = None, mask: A
 
 
 def ssim(volume: Values, truth: Values, data_range: float | None = None, progress: Progress | None = None) -> float:
-    """Structural similarity, in three dimensions: 1 for the truth itself.
+    """Return the structural similarity in three dimensions; 1 for the truth itself.
 
     The mean of the SSIM index over all places where a window of 11 voxels along each axis fits: a Gaussian of 1.5 voxels,
     C1 = (0.01 range)^2 and C2 = (0.03 range)^2, as in Wang et al. 2004, "Image quality assessment: from error visibility to
@@ -86,8 +88,8 @@ def ssim(volume: Values, truth: Values, data_range: float | None = None, progres
     values, true = _pair(volume, truth, "ssim")
     span = _span(true, data_range, "ssim")
     shape = tuple(n for n in values.shape if n > 1)
-    if not shape or min(shape) < 2 * _RADIUS + 1:
-        text = f"one or at least {2 * _RADIUS + 1} voxels along each axis"
+    if not shape or min(shape) < WINDOW:
+        text = f"one or at least {WINDOW} voxels along each axis"
         raise InputError(f"ssim: expected {text}, got {shape_text(values.shape)}")
     values, true = values.reshape(shape), true.reshape(shape)
     c1, c2 = (_K1 * span) ** 2, (_K2 * span) ** 2
@@ -108,7 +110,7 @@ def ssim(volume: Values, truth: Values, data_range: float | None = None, progres
 
 
 def contrast_to_noise(volume: Values, target: ArrayLike, background: ArrayLike) -> float:
-    """Contrast-to-noise ratio: mean of the target minus mean of the background, by the background's standard deviation.
+    """Return (mean of the target - mean of the background) / standard deviation of the background.
 
     Negative for a target colder than its background; infinite if the background is the same everywhere and the target is
     not. (Cherry, Sorenson, Phelps 2012, Physics in Nuclear Medicine, 4th edition, chapter 15.)
@@ -132,14 +134,14 @@ def contrast_to_noise(volume: Values, target: ArrayLike, background: ArrayLike) 
 
 
 class BiasAndDeviation(NamedTuple):
-    """What `bias_and_deviation` gives."""
+    """Bias and standard deviation of several reconstructions, voxel by voxel; the result of `bias_and_deviation`."""
 
     bias: Volume
     deviation: Volume
 
 
 def bias_and_deviation(volumes: Iterable[Volume], truth: Volume) -> BiasAndDeviation:
-    """Bias and standard deviation of reconstructions of several noise draws of the same counts, in each voxel.
+    """Return bias and standard deviation, in each voxel, of reconstructions of several noise draws of the same counts.
 
     The bias is the mean of the draws minus the truth, the deviation the sample standard deviation (n - 1). The mean square
     error of n draws is the bias squared plus (n - 1) / n times the deviation squared (Barrett, Myers 2004, Foundations of
@@ -173,7 +175,7 @@ def bias_and_deviation(volumes: Iterable[Volume], truth: Volume) -> BiasAndDevia
 
 
 def _pair(volume: Values, truth: Values, name: str, mask: ArrayLike | None = None) -> tuple[Floats, Floats]:
-    """The values of both, float64, checked to belong to the same voxels; those of the mask, if there is one."""
+    """Return the values of both volumes, float64, in the mask if there is one; raise `InputError` if their voxels differ."""
     if isinstance(volume, Volume) and isinstance(truth, Volume):
         _require_fit(volume, truth, name)
     values, true = _values(volume, name), _values(truth, f"{name}: truth")
@@ -220,7 +222,7 @@ def _span(true: Floats, data_range: Any, name: str) -> float:
 
 
 def _windowed(values: Floats) -> Floats:
-    """Means under the Gaussian window, where it fits."""
+    """Return the means under the Gaussian window, where it fits."""
     weights = np.exp(-0.5 * (np.arange(-_RADIUS, _RADIUS + 1) / _SIGMA) ** 2)
     weights /= weights.sum()
     for axis in range(values.ndim):

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -12,7 +13,7 @@ from ...phantoms.nema import NemaBody, outline_distance, sphere_positions
 from ...validation import freeze, instance
 from ...volumes.resampling import values_at
 from ...volumes.volume import Volume, require_quantity
-from .rows import Rows, column
+from .rows import Rows, aligned_columns, column, json_number
 
 _SLICES = (-20.0, -10.0, 0.0, 10.0, 20.0)  # of the background regions, mm from the spheres' centres
 _IN_SLICE = 12  # background regions
@@ -50,9 +51,33 @@ class NemaScore(Rows[NemaSphere]):
     contrast_recovery = column("contrast_recovery", "Percent.")
     background_variability = column("background_variability", "Percent.")
 
+    @property
+    def lines(self) -> list[str]:
+        """The scores as a table of text, and a line on the lung insert."""
+        percents = ((f"{s.contrast_recovery:.1f} %", f"{s.background_variability:.1f} %") for s in self)
+        rows = [(f"{s.diameter:g} mm", *texts) for s, texts in zip(self, percents, strict=True)]
+        lung = [] if math.isnan(self.lung_residual) else [self.lung_residual]
+        return [
+            *aligned_columns(("Spheres", "contrast recovery", "background variability"), rows),
+            *(f"Lung insert: {percent:.1f} % of the background remain" for percent in lung),
+        ]
+
+    @property
+    def record(self) -> dict[str, Any]:
+        """The scores as JSON can hold them, None for an unknown number."""
+        columns = ("diameter", "contrast_recovery", "background_variability")
+        spheres = [{name: getattr(sphere, name) for name in columns} for sphere in self]
+        return {"nema": spheres, "lung_residual": json_number(self.lung_residual)}
+
+    @property
+    def cells(self) -> list[tuple[str, str]]:
+        """Names and values, as text, for the table of Blender's panel."""
+        form = "{0.contrast_recovery:.1f} % contrast, {0.background_variability:.1f} % variability"
+        return [(f"{sphere.diameter:g} mm sphere", form.format(sphere)) for sphere in self]
+
 
 def nema_score(volume: Volume, phantom: NemaBody, pose: ArrayLike | None = None) -> NemaScore:
-    """Percent contrast and background variability of a reconstructed NEMA body phantom, by NEMA NU 2-2018, section 7.
+    """Score a reconstructed NEMA body phantom: contrast and background variability by NEMA NU 2-2018, section 7.
 
     Regions are circles in the phantom's transverse planes; parts of voxels count as such. That of a sphere lies in the plane
     of the spheres' centres and has its inner diameter. Of each diameter there are 12 background regions in each of 5 planes,
@@ -125,7 +150,7 @@ def _level(background: Floats) -> float:
 
 
 def _means(volume: Volume, world: Floats, centers: Floats, diameter: float, name: str) -> Floats:
-    """Means (n,) over circles in the phantom's planes, around `centers` (n, 3) in its frame."""
+    """Return the means (n,) over circles in the phantom's planes, around `centers` (n, 3) in its frame."""
     grid = volume.grid
     # Points that stand for equal areas of a circle, along a spiral with turns of the golden angle (Vogel 1979).
     count = math.ceil(_POINTS * math.pi / 4 * max(5.0, diameter / grid.spacing.min()) ** 2)
@@ -141,7 +166,7 @@ def _means(volume: Volume, world: Floats, centers: Floats, diameter: float, name
 
 
 def _background_places(phantom: NemaBody) -> Floats:
-    """x and y (12, 2), mm, of background regions in the phantom's frame."""
+    """Return x and y (12, 2), mm, of background regions in the phantom's frame."""
     body = next(shape for shape in phantom.shapes if shape.name == "front")
     low = body.position[2] - phantom.length / 2
     if low > min(_SLICES):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import os
+import re
 import subprocess
 import sys
 from collections.abc import Callable
@@ -20,6 +21,7 @@ from mphdrr.core.geometry.frames import euler_pose
 from mphdrr.core.geometry.grid import Grid
 from mphdrr.core.geometry.system import PinholeSystem
 from mphdrr.core.projector import Emission
+from mphdrr.core.recording import recorded_warnings
 from mphdrr.core.volumes.volume import Volume
 from mphdrr.core.workbook import read_system
 
@@ -36,6 +38,20 @@ BACKENDS = ["numpy", pytest.param("torch", marks=needs_torch), "cpu"]
 @pytest.fixture
 def rng() -> np.random.Generator:
     return np.random.default_rng(20261121)
+
+
+@pytest.fixture
+def command(capsys: pytest.CaptureFixture[str]) -> Callable[..., Any]:
+    """Return a function that runs `mphdrr` with words, checks its status, and returns what it printed: `out`, `err`."""
+
+    def run(*words: object, status: int = 0) -> Any:
+        capsys.readouterr()
+        result = main([*map(str, words)])
+        printed = capsys.readouterr()
+        assert result == status, printed.err
+        return printed
+
+    return run
 
 
 @pytest.fixture(scope="session")
@@ -106,11 +122,19 @@ def same_matter(grid: Grid, mu: np.ndarray) -> list[Volume]:
 
 
 def refused(call: Callable[[], object], *words: str) -> None:
-    """`call` is refused in one line that has these words."""
+    """Check that `call` is refused in one line that has these words, or what matches them as regular expressions."""
     with pytest.raises(InputError) as error:
         call()
     text = str(error.value)
-    assert all(word in text for word in words) and "\n" not in text, text
+    assert all(word in text or re.search(word, text) for word in words) and "\n" not in text, text
+
+
+def warned(call: Callable[[], object]) -> list[str]:
+    """Return the warnings of `call`, each one a line."""
+    with recorded_warnings() as texts:
+        call()
+    assert not any("\n" in text for text in texts)
+    return texts
 
 
 def stop(*_: object) -> None:

@@ -48,7 +48,7 @@ def mlem(
         Measured counts, 0 or more; expected counts, which may be fractions, are allowed too.
     iterations : int
         Number of iterations of this call. Without a prior the log-likelihood never falls from one to the next.
-    background : number, array (M,) or (M, n_v, n_u)
+    background : float, array (M,) or (M, n_v, n_u)
         Expected counts that do not come from the volume, such as scatter.
     *options, **named
         See `IterativeOptions`. Without `start` every voxel begins with 1; voxels that are 0 in `start` stay 0.

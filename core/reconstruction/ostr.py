@@ -48,7 +48,7 @@ def ostr(
         more it gets near the maximum sooner.
     prior : Quadratic, RelativeDifference or TotalVariation, optional
         Penalty on noise. A prior's `edge` is in the volume's unit, here 1/mm: for tissue, a thousandth of 1/mm is suitable.
-    photons : number or array (M, n_v, n_u), optional
+    photons : float or array (M, n_v, n_u), optional
         Photons of a pixel without any attenuation. By default 1: the prior's weight is then relative to one photon.
     iterations, nonnegative, *options, **named
         See `sirt`.

@@ -2,6 +2,8 @@
 
 A package is imported when its adapter is called. The adapted operators compute with `Projector` alone: the same numbers,
 kernels and exact adjoint.
+
+To add a package, write a module here that imports it, and a function below that imports the module when it is called.
 """
 
 import importlib

@@ -39,20 +39,11 @@ class ReadVolumes(jobs.JobOperator):
     attenuation: BoolProperty(
         name="CT to Attenuation", description="Convert CT numbers (HU) to attenuation coefficients (1/mm)"
     )
-    energy: FloatProperty(
-        name="Energy (keV)",
-        description="Energy of the photons in keV: 140.5 for Tc-99m",
-        default=140.5,
-        min=10.0,
-        max=1000.0,
-    )
+    energy: FloatProperty(name="Energy (keV)", description="Energy of the photons in keV: 140.5 for Tc-99m",
+                          default=140.5, min=10.0, max=1000.0)  # fmt: skip
     grid: StringProperty(name="Grid", description="Grid of an OpenVDB file that holds several", options={"SKIP_SAVE"})
-    unit: FloatProperty(
-        name="Unit (mm)",
-        description="Length in mm of the unit of another program's OpenVDB file",
-        default=1.0,
-        min=1e-6,
-    )
+    unit: FloatProperty(name="Unit (mm)", description="Length in mm of the unit of another program's OpenVDB file",
+                        default=1.0, min=1e-6)  # fmt: skip
 
     first_properties: tuple[str, ...] = ("name",)  # properties of a derived class, drawn first
 

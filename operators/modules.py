@@ -75,10 +75,8 @@ class MPHDRR_OT_duplicate_modules(selection.OnModules, bpy.types.Operator):
     bl_label = "Duplicate Along Ring"
 
     count: IntProperty(name="Copies", description="Number of copies of each module", default=1, min=1, soft_max=40)
-    angle: FloatProperty(
-        name="Angle", description="From one copy to the next, about the z axis", subtype="ANGLE",
-        default=math.radians(9.0), min=-math.pi, max=math.pi,
-    )  # fmt: skip
+    angle: FloatProperty(name="Angle", description="From one copy to the next, about the z axis", subtype="ANGLE",
+                         default=math.radians(9.0), min=-math.pi, max=math.pi)  # fmt: skip
     follow_ring: BoolProperty(
         name="Follow Ring",
         description="Take z and the distance from the z axis from the ring's other modules at the new azimuth, so that "
@@ -188,10 +186,8 @@ class MPHDRR_OT_add_map(jobs.JobOperator, bpy.types.Operator):
     voxels: IntProperty(
         name="Voxels", description="Voxels along each side of the map", default=64, min=2, soft_max=256, max=1024
     )
-    side: FloatProperty(
-        name="Side (mm)", description="Side of the map's cube in mm; 0 takes the diameter of the ROI", default=0.0,
-        min=0.0, soft_max=500.0,
-    )  # fmt: skip
+    side: FloatProperty(name="Side (mm)", description="Side of the map's cube in mm; 0 takes the diameter of the ROI",
+                        default=0.0, min=0.0, soft_max=500.0)  # fmt: skip
     within_roi: BoolProperty(name="Within ROI", description="Set voxels outside the ROI sphere to 0", default=True)
 
     def job(self, context: bpy.types.Context) -> jobs.Job:

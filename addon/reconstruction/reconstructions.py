@@ -90,10 +90,9 @@ def continue_job(context: bpy.types.Context) -> jobs.Job:
     if run is None:
         raise InputError(f"the run that it is of ({file}) has left the list of runs: reconstruct again")
     values, extent = reconstruction.volume.array, item.mphdrr_volume.extent
-    stored = stored_volumes.StoredVolume(
-        (reconstruction.volume,), volumes.pose_of_object(item), storage.absolute(item.data.filepath),
-        float(values.min()), float(values.max()), extent,
-    )  # fmt: skip
+    stored = stored_volumes.StoredVolume((reconstruction.volume,), volumes.pose_of_object(item),
+                                         storage.absolute(item.data.filepath), float(values.min()), float(values.max()),
+                                         extent)  # fmt: skip
     recipe = recipe_from_tables(reconstruction.settings["recipe"]).updated(
         {"reconstruction.iterations": MORE_ITERATIONS}
     )

@@ -331,11 +331,10 @@ def _make_result(views: Views, bundle: BundleAdjustment, x: Floats, spots: Spots
     names = (*_PARAMETERS, *(name for kind in bundle.fit for name in further_names[kind]))
     gauge = ("shift", "turn", "scale")[: len(bundle.gauge()) // 3 + len(bundle.gauge()) % 3]
     system = nominal.replace(centers=fitted.centers, tilt=fitted.tilt, collimator_length=fitted.length)
-    return Calibration(
-        system, nominal, _move_views(views, nominal, fitted), fitted.points, covariance[:, :6, :6], chi_square, misfit,
-        tuple(nominal.numbers[misfits].tolist()), used, names, np.sqrt(np.diagonal(covariance, axis1=1, axis2=2)), told,
-        gauge, fitted.offset, excess / np.sqrt(np.maximum(total, 1)),
-    )  # fmt: skip
+    return Calibration(system, nominal, _move_views(views, nominal, fitted), fitted.points, covariance[:, :6, :6],
+                       chi_square, misfit, tuple(nominal.numbers[misfits].tolist()), used, names,
+                       np.sqrt(np.diagonal(covariance, axis1=1, axis2=2)), told, gauge, fitted.offset,
+                       excess / np.sqrt(np.maximum(total, 1)))  # fmt: skip
 
 
 def _is_improbable(per_freedom: Floats, freedom: Floats) -> Bools:

@@ -45,15 +45,8 @@ class MPHDRR_OT_import_counts(jobs.JobOperator, bpy.types.Operator):
         layout = layouts.labelled(self.layout)
         layouts.draw_all(layout, self, "frames", "orientation", "time")
         layouts.draw_all(layout.column(heading="If Needed"), self, "modules", "pixel", "expected", "dataset")
-        layouts.draw_all(
-            layout.column(heading="Scatter"),
-            self,
-            "lower_frames",
-            "upper_frames",
-            "window_widths",
-            "scatter_fwhm",
-            "scatter_tails",
-        )
+        scatter = "lower_frames", "upper_frames", "window_widths", "scatter_fwhm", "scatter_tails"
+        layouts.draw_all(layout.column(heading="Scatter"), self, *scatter)
         layouts.draw_all(layout.column(heading="Raw File"), self, "raw_type", "raw_shape", "raw_big_endian")
 
     def job(self, context: bpy.types.Context) -> jobs.Job:

@@ -109,22 +109,17 @@ class MPHDRR_OT_import_geometry(bpy.types.Operator):
         for further in self._further_scanners:
             scanner.build_scanner(context.scene, further, self._scanner_name(further), replace=self.replace)
         context.scene.camera = camera  # if it is none, the first camera of `system` becomes the scene's
+        construction = Construction(self.plate_thickness, self.wall_thickness)
+        shape = self.image_size[1], self.image_size[0]
         collection = scanner.build_scanner(
-            context.scene,
-            system,
-            self.name,
-            construction=Construction(self.plate_thickness, self.wall_thickness),
-            shape=(self.image_size[1], self.image_size[0]),
-            replace=self.replace,
+            context.scene, system, self.name, construction=construction, shape=shape, replace=self.replace
         )
         studio.light(context.scene)
         context.view_layer.update()  # so that scripts find the children's matrix_world in place
         self._dialog = ""
         column_maps.clear(context.window_manager.mphdrr_columns)
-        further_modules = "".join(
-            f" and {len(scanner)} of the kind {scanner.kind}" for scanner in self._further_scanners
-        )
-        return f"Imported {len(system)} modules{further_modules} into '{collection.name}'"
+        additions = "".join(f" and {len(scanner)} of the kind {scanner.kind}" for scanner in self._further_scanners)
+        return f"Imported {len(system)} modules{additions} into '{collection.name}'"
 
     def cancel(self, context: bpy.types.Context) -> None:
         column_maps.clear(context.window_manager.mphdrr_columns)

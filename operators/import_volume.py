@@ -21,15 +21,11 @@ class ReadVolumes(jobs.JobOperator):
     """Base class of the operators that read volumes, with the settings of reading."""
 
     quantity: EnumProperty(
-        name="Values", description="Quantity of the voxels",
-        items=choices.items(
-            choices.READ_AS,
-            (
-                ("AUTO", "As the File Says", "If a file does not say: activity in OpenVDB, CT numbers in others"),
-                *((name, name.capitalize(), f"In {unit}") for name, unit in UNITS.items()),
-            ),
-        ),
-        default="AUTO",
+        name="Values", description="Quantity of the voxels", default="AUTO",
+        items=choices.items(choices.READ_AS, (
+            ("AUTO", "As the File Says", "If a file does not say: activity in OpenVDB, CT numbers in others"),
+            *((name, name.capitalize(), f"In {unit}") for name, unit in UNITS.items()),
+        )),
     )  # fmt: skip
     center: BoolProperty(
         name="Centre at Isocentre",
@@ -56,16 +52,10 @@ class ReadVolumes(jobs.JobOperator):
         layouts.draw_all(layout.column(heading="OpenVDB", align=True), self, "grid", "unit")
 
     def import_job(self, paths: Sequence[Path], name: str, frame_start: int = 1) -> jobs.Job:
-        return import_job(
-            paths,
-            name,
-            quantity=None if self.quantity == "AUTO" else self.quantity,
-            center=self.center,
-            energy=decimals.typed(self.energy) if self.attenuation else None,
-            grid=self.grid or None,
-            unit=decimals.typed(self.unit),
-            frame_start=frame_start,
-        )
+        quantity = None if self.quantity == "AUTO" else self.quantity
+        energy = decimals.typed(self.energy) if self.attenuation else None
+        settings = {"center": self.center, "grid": self.grid or None, "unit": decimals.typed(self.unit)}
+        return import_job(paths, name, quantity=quantity, energy=energy, frame_start=frame_start, **settings)
 
 
 class MPHDRR_OT_import_volume(ReadVolumes, bpy.types.Operator):

@@ -16,16 +16,14 @@ class MPHDRR_OT_show_modules(selection.OnScanner, bpy.types.Operator):
     first: IntProperty(name="First", description="First module number of the range", default=1)
     last: IntProperty(name="Last", description="Last module number of the range", default=1)
     mode: EnumProperty(
-        name="Mode",
-        description="What to do with the modules of the range and the others",
+        name="Mode", description="What to do with the modules of the range and the others", default="ONLY",
         items=[
             ("ONLY", "Show Only", "Show the modules of the range and hide all others", 0),
             ("SHOW", "Show", "Show the modules of the range; the others stay as they are", 1),
             ("HIDE", "Hide", "Hide the modules of the range; the others stay as they are", 2),
             ("ALL", "Show All", "Show all modules", 3),
         ],
-        default="ONLY",
-    )
+    )  # fmt: skip
 
     def change(self, context: bpy.types.Context, collection: bpy.types.Collection) -> str:
         return f"{scanner.show_modules(collection, self.first, self.last, self.mode)} modules visible"
@@ -117,13 +115,12 @@ class MPHDRR_OT_renumber_modules(selection.OnScanner, bpy.types.Operator):
     """Number all modules 1, 2, ...; they are listed, projected and exported in that order from now on."""
 
     order: EnumProperty(
-        name="Order",
-        description="Order that the numbers follow",
+        name="Order", description="Order that the numbers follow",
         items=(
             ("RINGS", "By Ring and Azimuth", "Ring by ring along +z, and along each ring from its largest gap on", 0),
             ("LIST", "As Listed", "The present order: that of the workbook, then added modules", 1),
         ),
-    )
+    )  # fmt: skip
 
     def change(self, context: bpy.types.Context, collection: bpy.types.Collection) -> str:
         changed = module_edits.renumber(collection, self.order)

@@ -24,9 +24,8 @@ INSTALL_BLENDER = 'pip install "mphdrr[blender]", or ".[blender]" in its source;
 
 def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
     """Add the command."""
-    parser = add_command(
-        subparsers, "scene", COMMANDS[__name__], "mphdrr scene scanner.xlsx --run run.h5 -o scanner.blend"
-    )
+    example = "mphdrr scene scanner.xlsx --run run.h5 -o scanner.blend"
+    parser = add_command(subparsers, "scene", COMMANDS[__name__], example)
     add_workbook(parser)
     add = parser.add_argument
     add("--modules", metavar="RANGE", help="such as 1-40 or 1-20,41; default: all")

@@ -318,9 +318,8 @@ def show_modules(collection: bpy.types.Collection, first: int, last: int, mode: 
     chosen = {o for o in cameras_ if mode == "ALL" or first <= o.mphdrr_module.number <= last}
     if not chosen:
         numbers = [o.mphdrr_module.number for o in cameras_] or [0]
-        raise InputError(
-            f"no module between {first} and {last}: '{collection.name}' has {min(numbers)} to {max(numbers)}"
-        )
+        span = f"{min(numbers)} to {max(numbers)}"
+        raise InputError(f"no module between {first} and {last}: '{collection.name}' has {span}")
     for camera, parts in following.parts_of(collection, cameras_).items():
         if camera in chosen or mode == "ONLY":
             _set_hidden([camera, *parts], mode == "HIDE" or camera not in chosen)

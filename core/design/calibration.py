@@ -322,9 +322,8 @@ def _make_result(views: Views, bundle: BundleAdjustment, x: Floats, spots: Spots
     spot_freedom, pixel_freedom = (2 * used - leverages).sum(axis=0), (seen * (freedom + 2) - leverages).sum(axis=0)
     sums = ((used * squared).sum(axis=0), spot_freedom), ((seen * (pearson + squared)).sum(axis=0), pixel_freedom)
     misfit, chi_square = (np.where(n > 0.5, total / np.maximum(n, 0.5), np.nan) for total, n in sums)
-    misfits = (
-        (seen & ~used).any(axis=0) | _is_improbable(misfit, spot_freedom) | _is_improbable(chi_square, pixel_freedom)
-    )
+    misfits = (seen & ~used).any(axis=0) | _is_improbable(misfit, spot_freedom)
+    misfits |= _is_improbable(chi_square, pixel_freedom)
     expected = spots.expected(lattice, (fitted.project_points() - lattice.first) / lattice.step)
     excess, total = ((seen[..., None, None] * w).sum(axis=0) for w in (spots.windows - expected, expected))
     further_names = {LENGTH: ("length",), OFFSET: ("offset u", "offset v")}

@@ -82,9 +82,8 @@ class DepthResponse:
         used = self.padded_kernels != 0
         if self.node_positions is not None:
             used[:, :-1] |= used[:, 1:]
-        return np.stack([used.argmax(-1), used.shape[-1] - used[..., ::-1].argmax(-1)], -1) * used.any(
-            -1, keepdims=True
-        )
+        bounds = np.stack([used.argmax(-1), used.shape[-1] - used[..., ::-1].argmax(-1)], -1)
+        return bounds * used.any(-1, keepdims=True)
 
     def node_responses(self) -> Iterator[tuple[Index, DepthResponse, Block, Block]]:
         """Yield each node's number along v and u, the response by its kernel alone, and the pixels and cells concerned.

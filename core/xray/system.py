@@ -220,9 +220,8 @@ class XraySystem(Scanner):
         """Return the solids of all sources: a cube behind the focal spot, for the tube, and the panel."""
         poses, parts = self.poses(), []
         poses[:, :3, [0, 2]] *= -1  # camera space is X = -u, Y = v, Z = -k
-        for number, pose, (x, y, depth, *sides) in zip(
-            self.numbers.tolist(), poses, self.fields().tolist(), strict=True
-        ):
+        numbers, fields = self.numbers.tolist(), self.fields().tolist()
+        for number, pose, (x, y, depth, *sides) in zip(numbers, poses, fields, strict=True):
             tube = _box((0.0, 0.0), (_TUBE, _TUBE), (0.0, _TUBE))
             panel = _box((x, y), (abs(sides[0]), abs(sides[1])), (-depth - PANEL_THICKNESS, -depth))
             parts.append(ModulePart(number, "source", f"Source {number:02d}", (tube, BOX_FACES), pose))

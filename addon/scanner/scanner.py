@@ -233,10 +233,8 @@ def read_scanner(collection: bpy.types.Collection) -> Scanner:
     for camera in cameras_:
         first = by_number.setdefault(camera.mphdrr_module.number, camera)
         if first is not camera:
-            raise InputError(
-                f"'{first.name}' and '{camera.name}' both have module number {camera.mphdrr_module.number}: "
-                f"press Tidy Modules in the Design panel, or delete one"
-            )
+            number, advice = camera.mphdrr_module.number, "press Tidy Modules in the Design panel, or delete one"
+            raise InputError(f"'{first.name}' and '{camera.name}' both have module number {number}: {advice}")
     is_added = any(camera.mphdrr_module.added for camera in cameras_)
     is_complete = len(cameras_) == collection.mphdrr_scanner.n_modules and not is_added
     as_imported = is_complete and not any(map(any, changed_modules(cameras_)))

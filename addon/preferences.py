@@ -33,10 +33,9 @@ class MPHDRR_Preferences(bpy.types.AddonPreferences):
 
     bl_idname = PACKAGE
 
-    threads: IntProperty(
-        name="Threads", description="Processor threads for projections unless the panel sets them; 0: all",
-        default=0, min=0, soft_max=64, update=_apply,
-    )  # fmt: skip
+    threads: IntProperty(name="Threads",
+                         description="Processor threads for projections unless the panel sets them; 0: all", default=0,
+                         min=0, soft_max=64, update=_apply)  # fmt: skip
     copies: BoolProperty(
         name="Save As Copies Files", description="Copy the voxels and runs of a scene into the folder beside the new "
         ".blend; else both .blend files share those of the old one",

@@ -63,18 +63,15 @@ class ModuleProperties(bpy.types.PropertyGroup):
         default="NONE",
         items=choices.items(choices.PARTS, ((part, part.capitalize(), "") for part in dict.fromkeys((*ids.PARTS, *PARTS)))),
     )  # fmt: skip
-    visible: BoolProperty(
-        name="Visible", description="Show the module, its collimator and its crystal, also in renders",
-        get=_is_visible, set=_set_visible,
-    )  # fmt: skip
+    visible: BoolProperty(name="Visible",
+                          description="Show the module, its collimator and its crystal, also in renders",
+                          get=_is_visible, set=_set_visible)  # fmt: skip
     number: IntProperty(name="Number", description="Module number, as in the workbook")
     index: IntProperty(name="Index", description="Index of the module in its system, from 0", min=0, options={"HIDDEN"})
     ring: IntProperty(name="Ring", description="Ring of the module, counted from 0", min=0)
     added: BoolProperty(name="Added", description="The module is not in the workbook", options={"HIDDEN"})
-    length_mode: EnumProperty(
-        name="Length", description="Origin of the collimator's length l", items=_LENGTH_MODES, default="TYPED",
-        update=on_edit("module"),
-    )  # fmt: skip
+    length_mode: EnumProperty(name="Length", description="Origin of the collimator's length l", items=_LENGTH_MODES,
+                              default="TYPED", update=on_edit("module"))  # fmt: skip
     exact: StringProperty(
         name="Exact Values", description="Numbers and pose as imported, float64 JSON", options={"HIDDEN"}
     )
@@ -171,10 +168,8 @@ def _is_scanner(self: GeometryProperties, collection: bpy.types.Collection) -> b
 class GeometryProperties(bpy.types.PropertyGroup):
     """State of the Geometry panel; `Scene.mphdrr_geometry`."""
 
-    scanner: PointerProperty(
-        name="Scanner", description="Scanner that the panels work on: the active object's",
-        type=bpy.types.Collection, poll=_is_scanner, update=on_edit("scanner_chosen"),
-    )  # fmt: skip
+    scanner: PointerProperty(name="Scanner", description="Scanner that the panels work on: the active object's",
+                             type=bpy.types.Collection, poll=_is_scanner, update=on_edit("scanner_chosen"))  # fmt: skip
     active_index: IntProperty(
         name="Active Module", description="Index among the scanner's objects", update=on_edit("active_module")
     )
@@ -184,22 +179,19 @@ class GeometryProperties(bpy.types.PropertyGroup):
     first: IntProperty(name="First", description="First module number of the range", default=1)
     last: IntProperty(name="Last", description="Last module number of the range", default=40)
     # Lines that `sight_lines.py` draws in the 3D views.
-    show_rays: BoolProperty(
-        name="Ray", description="Draw the principal ray, through the isocentre to the virtual detector",
-        update=on_edit("sight_lines"),
-    )  # fmt: skip
+    show_rays: BoolProperty(name="Ray",
+                            description="Draw the principal ray, through the isocentre to the virtual detector",
+                            update=on_edit("sight_lines"))  # fmt: skip
     show_frustums: BoolProperty(
         name="Frustum", description="Draw the field of view, from the pinhole to the virtual detector's corners",
         update=on_edit("sight_lines"),
     )  # fmt: skip
-    show_detectors: BoolProperty(
-        name="Detector", description="Draw the virtual detector at its distance, the magnification times l",
-        update=on_edit("sight_lines"),
-    )  # fmt: skip
-    sight_all: BoolProperty(
-        name="All Modules", description="Draw the lines of all visible modules, not of the active one only",
-        update=on_edit("sight_lines"),
-    )  # fmt: skip
+    show_detectors: BoolProperty(name="Detector",
+                                 description="Draw the virtual detector at its distance, the magnification times l",
+                                 update=on_edit("sight_lines"))  # fmt: skip
+    sight_all: BoolProperty(name="All Modules",
+                            description="Draw the lines of all visible modules, not of the active one only",
+                            update=on_edit("sight_lines"))  # fmt: skip
 
 
 _ROOMS = (

@@ -18,9 +18,8 @@ class MPHDRR_OT_calibrate(jobs.JobOperator, bpy.types.Operator):
     asks_for = "filepath"
     filepath: file_properties.file_property("Recipe of the calibration")
     filter_glob: file_properties.shown_files([".toml"])
-    apply: BoolProperty(
-        name="Apply", description="Move the modules, not only show the shifts", default=True, options={"SKIP_SAVE"},
-    )  # fmt: skip
+    apply: BoolProperty(name="Apply", description="Move the modules, not only show the shifts", default=True,
+                        options={"SKIP_SAVE"})  # fmt: skip
     exaggeration: FloatProperty(
         name="Exaggeration", min=0.0, soft_max=1000.0,
         description="Length of the arrows in units of the shifts; 0: the longest arrow is about 50 mm",

@@ -14,10 +14,8 @@ from ..core.xray.dose import decays
 class MPHDRR_OT_add_slices(Reported, bpy.types.Operator):
     """Show an axial, a coronal and a sagittal slice of the active volume as planes that go with it."""
 
-    place: FloatVectorProperty(
-        name="Place", description="Point where the slices meet, as shares of the grid's axes", size=3, min=0.0,
-        max=1.0, default=(0.5, 0.5, 0.5), options={"SKIP_SAVE"},
-    )  # fmt: skip
+    place: FloatVectorProperty(name="Place", description="Point where the slices meet, as shares of the grid's axes",
+                               size=3, min=0.0, max=1.0, default=(0.5, 0.5, 0.5), options={"SKIP_SAVE"})  # fmt: skip
 
     poll = needs(volumes.ACTIVE)
 
@@ -65,12 +63,9 @@ class MPHDRR_OT_ct_to_attenuation(jobs.JobOperator, bpy.types.Operator):
 class MPHDRR_OT_add_dose_map(jobs.JobOperator, bpy.types.Operator):
     """Make a volume of the absorbed dose rate (mGy/h) from the active volume of activity, as in water of density 1."""
 
-    isotope: EnumProperty(
-        name="Isotope",
-        description="Isotope that decays",
-        items=choices.items({}, ((name, name, "") for name in decays())),
-        default="Tc-99m",
-    )
+    isotope: EnumProperty(name="Isotope", description="Isotope that decays",
+                          items=choices.items({}, ((name, name, "") for name in decays())),
+                          default="Tc-99m")  # fmt: skip
 
     poll = needs((_is_activity, "No activity is active: select a volume of activity"))
 

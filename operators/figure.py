@@ -36,10 +36,9 @@ class FigureOperator(jobs.ExportJob):
     )
     labels: BoolProperty(name="Labels", description="Write titles, axes and scales on rendered figures", default=True)
     style: EnumProperty(name="Style", description="Style of rendered figures", items=items({}, _STYLES), default="dark")
-    samples: IntProperty(
-        name="Samples", description="Rays per pixel of rendered figures: the more, the smoother and slower",
-        default=SAMPLES, min=1, soft_max=256,
-    )  # fmt: skip
+    samples: IntProperty(name="Samples",
+                         description="Rays per pixel of rendered figures: the more, the smoother and slower",
+                         default=SAMPLES, min=1, soft_max=256)  # fmt: skip
 
     poll = reports.needs(_SHOWN)
 

@@ -32,10 +32,8 @@ class MPHDRR_OT_import_counts(jobs.JobOperator, bpy.types.Operator):
     directory: DIRECTORY
     files: files_property("Files with counts, if several: their frames follow each other in the order of the names")
     filter_glob: shown_files(COUNTS_FORMATS)
-    time: FloatProperty(
-        name="Time (s)", description="Exposure of the frames in seconds; 0: that of the files", default=0.0, min=0.0,
-        options={"SKIP_SAVE"},
-    )  # fmt: skip
+    time: FloatProperty(name="Time (s)", description="Exposure of the frames in seconds; 0: that of the files",
+                        default=0.0, min=0.0, options={"SKIP_SAVE"})  # fmt: skip
     pixel: FloatProperty(
         name="Pixel (mm)",
         description="Side in mm of a pixel on the crystal; 0: the crystal's side divided by the number of pixels",
@@ -47,15 +45,8 @@ class MPHDRR_OT_import_counts(jobs.JobOperator, bpy.types.Operator):
         layout = layouts.labelled(self.layout)
         layouts.draw_all(layout, self, "frames", "orientation", "time")
         layouts.draw_all(layout.column(heading="If Needed"), self, "modules", "pixel", "expected", "dataset")
-        layouts.draw_all(
-            layout.column(heading="Scatter"),
-            self,
-            "lower_frames",
-            "upper_frames",
-            "window_widths",
-            "scatter_fwhm",
-            "scatter_tails",
-        )
+        scatter = "lower_frames", "upper_frames", "window_widths", "scatter_fwhm", "scatter_tails"
+        layouts.draw_all(layout.column(heading="Scatter"), self, *scatter)
         layouts.draw_all(layout.column(heading="Raw File"), self, "raw_type", "raw_shape", "raw_big_endian")
 
     def job(self, context: bpy.types.Context) -> jobs.Job:

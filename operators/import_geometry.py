@@ -39,14 +39,12 @@ class MPHDRR_OT_import_geometry(bpy.types.Operator):
 
     filepath: file_properties.file_property("Workbook to read")
     filter_glob: file_properties.shown_files(scanner_files.WORKBOOK_SUFFIXES)
-    name: StringProperty(
-        name="Name", description="Name of the scanner, which replaces one of the same name. Empty: the file's",
-        options={"SKIP_SAVE"},
-    )  # fmt: skip
-    columns: StringProperty(
-        name="Column Map", description="File (.toml) with the meaning of the columns. Empty: read the headings",
-        subtype="FILE_PATH", options={"SKIP_SAVE"},
-    )  # fmt: skip
+    name: StringProperty(name="Name",
+                         description="Name of the scanner, which replaces one of the same name. Empty: the file's",
+                         options={"SKIP_SAVE"})  # fmt: skip
+    columns: StringProperty(name="Column Map",
+                            description="File (.toml) with the meaning of the columns. Empty: read the headings",
+                            subtype="FILE_PATH", options={"SKIP_SAVE"})  # fmt: skip
     choose_columns: BoolProperty(
         name="Choose Columns",
         description="Set the meaning of the columns in a dialog. It opens by itself if the headings are not recognised",
@@ -55,16 +53,13 @@ class MPHDRR_OT_import_geometry(bpy.types.Operator):
     chosen_columns: StringProperty(
         name="Chosen Columns", description="Column map of the dialog, TOML", options={"HIDDEN", "SKIP_SAVE"}
     )
-    plate_thickness: FloatProperty(
-        name="Plate (mm)", description="Thickness in mm of the aperture plate that holds the pinhole",
-        default=2.0, min=0.01, soft_max=20.0,
-    )  # fmt: skip
-    wall_thickness: FloatProperty(
-        name="Wall (mm)", description="Thickness in mm of the collimator's walls", default=2.0, min=0.01, soft_max=20.0,
-    )  # fmt: skip
-    image_size: IntVectorProperty(
-        name="Image Size", description="Pixels of the cameras' pictures: columns, rows", size=2, default=(256, 256), min=1,
-    )  # fmt: skip
+    plate_thickness: FloatProperty(name="Plate (mm)",
+                                   description="Thickness in mm of the aperture plate that holds the pinhole",
+                                   default=2.0, min=0.01, soft_max=20.0)  # fmt: skip
+    wall_thickness: FloatProperty(name="Wall (mm)", description="Thickness in mm of the collimator's walls",
+                                  default=2.0, min=0.01, soft_max=20.0)  # fmt: skip
+    image_size: IntVectorProperty(name="Image Size", description="Pixels of the cameras' pictures: columns, rows",
+                                  size=2, default=(256, 256), min=1)  # fmt: skip
     replace: BoolProperty(
         name="Replace Changed Scanner",
         description="Replace a scanner of the same name even if it has been changed since it was imported",
@@ -114,22 +109,17 @@ class MPHDRR_OT_import_geometry(bpy.types.Operator):
         for further in self._further_scanners:
             scanner.build_scanner(context.scene, further, self._scanner_name(further), replace=self.replace)
         context.scene.camera = camera  # if it is none, the first camera of `system` becomes the scene's
+        construction = Construction(self.plate_thickness, self.wall_thickness)
+        shape = self.image_size[1], self.image_size[0]
         collection = scanner.build_scanner(
-            context.scene,
-            system,
-            self.name,
-            construction=Construction(self.plate_thickness, self.wall_thickness),
-            shape=(self.image_size[1], self.image_size[0]),
-            replace=self.replace,
+            context.scene, system, self.name, construction=construction, shape=shape, replace=self.replace
         )
         studio.light(context.scene)
         context.view_layer.update()  # so that scripts find the children's matrix_world in place
         self._dialog = ""
         column_maps.clear(context.window_manager.mphdrr_columns)
-        further_modules = "".join(
-            f" and {len(scanner)} of the kind {scanner.kind}" for scanner in self._further_scanners
-        )
-        return f"Imported {len(system)} modules{further_modules} into '{collection.name}'"
+        additions = "".join(f" and {len(scanner)} of the kind {scanner.kind}" for scanner in self._further_scanners)
+        return f"Imported {len(system)} modules{additions} into '{collection.name}'"
 
     def cancel(self, context: bpy.types.Context) -> None:
         column_maps.clear(context.window_manager.mphdrr_columns)

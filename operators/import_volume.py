@@ -21,15 +21,11 @@ class ReadVolumes(jobs.JobOperator):
     """Base class of the operators that read volumes, with the settings of reading."""
 
     quantity: EnumProperty(
-        name="Values", description="Quantity of the voxels",
-        items=choices.items(
-            choices.READ_AS,
-            (
-                ("AUTO", "As the File Says", "If a file does not say: activity in OpenVDB, CT numbers in others"),
-                *((name, name.capitalize(), f"In {unit}") for name, unit in UNITS.items()),
-            ),
-        ),
-        default="AUTO",
+        name="Values", description="Quantity of the voxels", default="AUTO",
+        items=choices.items(choices.READ_AS, (
+            ("AUTO", "As the File Says", "If a file does not say: activity in OpenVDB, CT numbers in others"),
+            *((name, name.capitalize(), f"In {unit}") for name, unit in UNITS.items()),
+        )),
     )  # fmt: skip
     center: BoolProperty(
         name="Centre at Isocentre",
@@ -39,20 +35,11 @@ class ReadVolumes(jobs.JobOperator):
     attenuation: BoolProperty(
         name="CT to Attenuation", description="Convert CT numbers (HU) to attenuation coefficients (1/mm)"
     )
-    energy: FloatProperty(
-        name="Energy (keV)",
-        description="Energy of the photons in keV: 140.5 for Tc-99m",
-        default=140.5,
-        min=10.0,
-        max=1000.0,
-    )
+    energy: FloatProperty(name="Energy (keV)", description="Energy of the photons in keV: 140.5 for Tc-99m",
+                          default=140.5, min=10.0, max=1000.0)  # fmt: skip
     grid: StringProperty(name="Grid", description="Grid of an OpenVDB file that holds several", options={"SKIP_SAVE"})
-    unit: FloatProperty(
-        name="Unit (mm)",
-        description="Length in mm of the unit of another program's OpenVDB file",
-        default=1.0,
-        min=1e-6,
-    )
+    unit: FloatProperty(name="Unit (mm)", description="Length in mm of the unit of another program's OpenVDB file",
+                        default=1.0, min=1e-6)  # fmt: skip
 
     first_properties: tuple[str, ...] = ("name",)  # properties of a derived class, drawn first
 
@@ -65,16 +52,10 @@ class ReadVolumes(jobs.JobOperator):
         layouts.draw_all(layout.column(heading="OpenVDB", align=True), self, "grid", "unit")
 
     def import_job(self, paths: Sequence[Path], name: str, frame_start: int = 1) -> jobs.Job:
-        return import_job(
-            paths,
-            name,
-            quantity=None if self.quantity == "AUTO" else self.quantity,
-            center=self.center,
-            energy=decimals.typed(self.energy) if self.attenuation else None,
-            grid=self.grid or None,
-            unit=decimals.typed(self.unit),
-            frame_start=frame_start,
-        )
+        quantity = None if self.quantity == "AUTO" else self.quantity
+        energy = decimals.typed(self.energy) if self.attenuation else None
+        settings = {"center": self.center, "grid": self.grid or None, "unit": decimals.typed(self.unit)}
+        return import_job(paths, name, quantity=quantity, energy=energy, frame_start=frame_start, **settings)
 
 
 class MPHDRR_OT_import_volume(ReadVolumes, bpy.types.Operator):

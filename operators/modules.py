@@ -16,16 +16,14 @@ class MPHDRR_OT_show_modules(selection.OnScanner, bpy.types.Operator):
     first: IntProperty(name="First", description="First module number of the range", default=1)
     last: IntProperty(name="Last", description="Last module number of the range", default=1)
     mode: EnumProperty(
-        name="Mode",
-        description="What to do with the modules of the range and the others",
+        name="Mode", description="What to do with the modules of the range and the others", default="ONLY",
         items=[
             ("ONLY", "Show Only", "Show the modules of the range and hide all others", 0),
             ("SHOW", "Show", "Show the modules of the range; the others stay as they are", 1),
             ("HIDE", "Hide", "Hide the modules of the range; the others stay as they are", 2),
             ("ALL", "Show All", "Show all modules", 3),
         ],
-        default="ONLY",
-    )
+    )  # fmt: skip
 
     def change(self, context: bpy.types.Context, collection: bpy.types.Collection) -> str:
         return f"{scanner.show_modules(collection, self.first, self.last, self.mode)} modules visible"
@@ -75,10 +73,8 @@ class MPHDRR_OT_duplicate_modules(selection.OnModules, bpy.types.Operator):
     bl_label = "Duplicate Along Ring"
 
     count: IntProperty(name="Copies", description="Number of copies of each module", default=1, min=1, soft_max=40)
-    angle: FloatProperty(
-        name="Angle", description="From one copy to the next, about the z axis", subtype="ANGLE",
-        default=math.radians(9.0), min=-math.pi, max=math.pi,
-    )  # fmt: skip
+    angle: FloatProperty(name="Angle", description="From one copy to the next, about the z axis", subtype="ANGLE",
+                         default=math.radians(9.0), min=-math.pi, max=math.pi)  # fmt: skip
     follow_ring: BoolProperty(
         name="Follow Ring",
         description="Take z and the distance from the z axis from the ring's other modules at the new azimuth, so that "
@@ -119,13 +115,12 @@ class MPHDRR_OT_renumber_modules(selection.OnScanner, bpy.types.Operator):
     """Number all modules 1, 2, ...; they are listed, projected and exported in that order from now on."""
 
     order: EnumProperty(
-        name="Order",
-        description="Order that the numbers follow",
+        name="Order", description="Order that the numbers follow",
         items=(
             ("RINGS", "By Ring and Azimuth", "Ring by ring along +z, and along each ring from its largest gap on", 0),
             ("LIST", "As Listed", "The present order: that of the workbook, then added modules", 1),
         ),
-    )
+    )  # fmt: skip
 
     def change(self, context: bpy.types.Context, collection: bpy.types.Collection) -> str:
         changed = module_edits.renumber(collection, self.order)
@@ -188,10 +183,8 @@ class MPHDRR_OT_add_map(jobs.JobOperator, bpy.types.Operator):
     voxels: IntProperty(
         name="Voxels", description="Voxels along each side of the map", default=64, min=2, soft_max=256, max=1024
     )
-    side: FloatProperty(
-        name="Side (mm)", description="Side of the map's cube in mm; 0 takes the diameter of the ROI", default=0.0,
-        min=0.0, soft_max=500.0,
-    )  # fmt: skip
+    side: FloatProperty(name="Side (mm)", description="Side of the map's cube in mm; 0 takes the diameter of the ROI",
+                        default=0.0, min=0.0, soft_max=500.0)  # fmt: skip
     within_roi: BoolProperty(name="Within ROI", description="Set voxels outside the ROI sphere to 0", default=True)
 
     def job(self, context: bpy.types.Context) -> jobs.Job:

@@ -21,9 +21,8 @@ class MPHDRR_OT_show_in_perspective(_PerspectiveOperator, bpy.types.Operator):
     """
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
-        return frustums.frustum_job(
-            context, *self.setting_values(context.scene.mphdrr_perspective, "planes", "uniform")
-        )
+        settings = context.scene.mphdrr_perspective
+        return frustums.frustum_job(context, *self.setting_values(settings, "planes", "uniform"))
 
 
 class MPHDRR_OT_resample_in_perspective(_PerspectiveOperator, bpy.types.Operator):
@@ -34,9 +33,8 @@ class MPHDRR_OT_resample_in_perspective(_PerspectiveOperator, bpy.types.Operator
     bl_label = "Volume Through Module"
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
-        return frustums.resample_job(
-            context, *self.setting_values(context.scene.mphdrr_perspective, "cells", "uniform")
-        )
+        settings = context.scene.mphdrr_perspective
+        return frustums.resample_job(context, *self.setting_values(settings, "cells", "uniform"))
 
 
 class MPHDRR_OT_clear_perspective(reports.Reported, bpy.types.Operator):

@@ -23,10 +23,9 @@ class MPHDRR_OT_pick_pixel(eyedropper.Eyedropper, reports.Reported, bpy.types.Op
     module: IntProperty(name="Module", description="Number of the module", default=1, options={"SKIP_SAVE"})
     column: FloatProperty(name="Column", description=_INDEX, options={"SKIP_SAVE"})
     row: FloatProperty(name="Row", description=_INDEX, options={"SKIP_SAVE"})
-    k: FloatProperty(
-        name="k", description="Magnification of the marker in this module; 0: unchanged, or that of the isocentre", min=0.0,
-        options={"SKIP_SAVE"},
-    )  # fmt: skip
+    k: FloatProperty(name="k",
+                     description="Magnification of the marker in this module; 0: unchanged, or that of the isocentre",
+                     min=0.0, options={"SKIP_SAVE"})  # fmt: skip
 
     target_words = "a pixel of a projection"
     poll = reports.needs(images.PROJECTED)

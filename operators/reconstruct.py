@@ -30,12 +30,9 @@ class MPHDRR_OT_reconstruct(reconstruction_properties.ReconstructionSettings, jo
         return super().ask(context)
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
-        return reconstructions.reconstruct_job(
-            context,
-            reconstruction_properties.settings_recipe(
-                self.setting_getter(context.scene.mphdrr_reconstruction), self.properties.is_property_set
-            ),
-        )
+        get = self.setting_getter(context.scene.mphdrr_reconstruction)
+        recipe = reconstruction_properties.settings_recipe(get, self.properties.is_property_set)
+        return reconstructions.reconstruct_job(context, recipe)
 
 
 class MPHDRR_OT_continue_reconstruction(jobs.JobOperator, bpy.types.Operator):
@@ -59,9 +56,8 @@ class MPHDRR_OT_backproject(reconstruction_properties.BackprojectionSettings, jo
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
         get = self.setting_getter(context.scene.mphdrr_reconstruction)
-        return backprojections.backproject_job(
-            context, reconstruction_properties.voxels_recipe(get), get("how").lower()
-        )
+        recipe = reconstruction_properties.voxels_recipe(get)
+        return backprojections.backproject_job(context, recipe, get("how").lower())
 
 
 class MPHDRR_OT_show_reconstruction(ShowPicture, bpy.types.Operator):

@@ -117,6 +117,5 @@ class MPHDRR_OT_export_dataset(jobs.ExportJob, bpy.types.Operator):
             self.layout.label(text=line, icon="ERROR")
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
-        return rendering.export_job(
-            context.scene, self.required_file("set filepath to a name ending in .h5, .npz or .pt")
-        )
+        path = self.required_file("set filepath to a name ending in .h5, .npz or .pt")
+        return rendering.export_job(context.scene, path)

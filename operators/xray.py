@@ -47,17 +47,11 @@ class MPHDRR_OT_add_xray_system(Reported, bpy.types.Operator):
 
     name: StringProperty(name="Name", description="The scanner's name; with a number, if it is taken", default="X-ray")
     arrangement: EnumProperty(
-        name="Arrangement",
-        description="Places of the sources; choosing one sets its usual numbers",
-        items=choices.items(
-            {},
-            (
-                ("ARC", "Arc", "In the open side of the modules"),
-                ("RING", "Ring", "All around, above or below the modules"),
-            ),
-        ),
+        name="Arrangement", description="Places of the sources; choosing one sets its usual numbers",
+        items=choices.items({}, (("ARC", "Arc", "In the open side of the modules"),
+                                 ("RING", "Ring", "All around, above or below the modules"))),
         update=_set_defaults,
-    )
+    )  # fmt: skip
     sources: IntProperty(name="Sources", description="Number of sources", default=24, min=1, soft_max=100)
     start: _angle("First Source", "Azimuth of the first source, from +x towards +y", -98.0)
     end: _angle("Last Source", "Azimuth of the last source", 8.0)

@@ -63,16 +63,10 @@ class MPHDRR_PT_geometry(Folded, bpy.types.Panel):
             box.operator("mphdrr.set_up_scene", icon="SCENE_DATA")
         properties = collection.mphdrr_scanner
         n_rings = sum(c.mphdrr_scanner.is_ring for c in collection.children)
-        draw_facts(
-            layout.split(factor=0.34),
-            ("Workbook", bpy.path.basename(properties.workbook) or "none"),
-            (
-                "Modules",
-                iface("{count} in {rings} rings" if n_rings > 1 else "{count} in a ring").format(
-                    count=properties.count, rings=n_rings
-                ),
-            ),
-        )
+        workbook = bpy.path.basename(properties.workbook) or "none"
+        modules = iface("{count} in {rings} rings" if n_rings > 1 else "{count} in a ring")
+        modules = modules.format(count=properties.count, rings=n_rings)
+        draw_facts(layout.split(factor=0.34), ("Workbook", workbook), ("Modules", modules))
         row = layout.row(align=True)
         for first, last in json.loads(properties.quick_ranges or "[]"):
             _draw_show(row, f"{first}-{last}", first, last, "ONLY")

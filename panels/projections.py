@@ -39,9 +39,8 @@ class MPHDRR_PT_projections(Folded, bpy.types.Panel):
         name.alignment = "RIGHT"  # like the settings' names
         name.label(text="Pixels")
         if pixels:  # the scanner's views have these pixels, whatever the settings are
-            split.label(
-                text=iface("{columns} × {rows}, its own").format(rows=pixels[0], columns=pixels[1]), translate=False
-            )
+            text = iface("{columns} × {rows}, its own").format(rows=pixels[0], columns=pixels[1])
+            split.label(text=text, translate=False)
         else:
             numbers = split.row(align=True)
             numbers.use_property_split = False

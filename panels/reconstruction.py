@@ -27,9 +27,8 @@ class MPHDRR_PT_reconstruction(Folded, bpy.types.Panel):
         if run is not None:  # the scene may have changed since poll
             layout.label(text=iface("Of {run}").format(run=run.name), translate=False, icon="RENDER_STILL")
         main = layout.column(align=True)
-        layouts.draw_settings(
-            main, settings, (setting for setting in panel_properties(settings) if setting[0] in _MAIN)
-        )
+        main_settings = (setting for setting in panel_properties(settings) if setting[0] in _MAIN)
+        layouts.draw_settings(main, settings, main_settings)
         row = layouts.invoking(layout.row())
         row.scale_y = 1.4
         row.operator("mphdrr.reconstruct", text="Reconstruct", icon="OUTLINER_OB_VOLUME")

@@ -20,9 +20,8 @@ class MPHDRR_UL_runs(bpy.types.UIList):
         row = layout.row(align=True)
         is_shown = item.file == data.run_file
         is_stale = is_shown and bool(runs.change_lines(context.scene))
-        row.prop(
-            item, "name", text="", emboss=False, icon="ERROR" if is_stale else "HIDE_OFF" if is_shown else "BLANK1"
-        )
+        eye = "ERROR" if is_stale else "HIDE_OFF" if is_shown else "BLANK1"
+        row.prop(item, "name", text="", emboss=False, icon=eye)
         size = row.row()
         size.alignment, size.active = "RIGHT", False
         size.label(text=runs.file_size_text([item]))

@@ -361,11 +361,10 @@ class JobOperator:
 
     def _tick(self, context: bpy.types.Context, interval: float | None) -> None:
         """Have `modal` called every `interval` seconds from now on; None: not any more."""
+        manager = context.window_manager
         if self._timer is not None:
-            context.window_manager.event_timer_remove(self._timer)
-        self._timer = (
-            None if interval is None else context.window_manager.event_timer_add(interval, window=context.window)
-        )
+            manager.event_timer_remove(self._timer)
+        self._timer = None if interval is None else manager.event_timer_add(interval, window=context.window)
 
     def _end(self, context: bpy.types.Context) -> None:
         """Stop watching the job and let the next one begin."""

@@ -61,11 +61,8 @@ def euler_angles(matrix: NDArray[np.float64]) -> tuple[float, float, float]:
     """Return a matrix's XYZ Euler angles, rad, in float64: Blender's float32 angles show -0.000007 degrees for 0."""
     r = matrix[:3, :3]
     y = -np.arcsin(np.clip(r[2, 0], -1.0, 1.0))
-    return (
-        float(np.arctan2(r[2, 1], r[2, 2])),
-        0.0 if abs(y) < 1e-12 else float(y),
-        float(np.arctan2(r[1, 0], r[0, 0])),
-    )
+    x, z = np.arctan2(r[2, 1], r[2, 2]), np.arctan2(r[1, 0], r[0, 0])
+    return float(x), 0.0 if abs(y) < 1e-12 else float(y), float(z)
 
 
 def collections_named(scene: bpy.types.Scene, name: str) -> list[bpy.types.Collection]:

@@ -26,9 +26,8 @@ def objective_icon(objective: Sequence[float]) -> int:
         draw_objective(page, objective, (8, 8, _PIXELS - 16, _PIXELS - 16), "", _CURVE, _INK, 3 * page.em)
         icon = _icons.new("objective")
         icon.image_size = (_PIXELS, _PIXELS)
-        colors = np.concatenate(
-            [page.picture[::-1] / np.float32(255), np.ones((_PIXELS, _PIXELS, 1), np.float32)], axis=2
-        )
+        opaque = np.ones((_PIXELS, _PIXELS, 1), np.float32)
+        colors = np.concatenate([page.picture[::-1] / np.float32(255), opaque], axis=2)
         icon.image_pixels_float[:] = colors.ravel().tolist()
         _drawn_objective = tuple(objective)
     return int(_icons["objective"].icon_id)

@@ -232,9 +232,8 @@ class _GatheredFiles:
             f"shares {_amount(self.shared)} with {owners}": self.shared,
             f"{_amount(self.outside)} elsewhere: Collect Files copies them": self.outside,
         }
-        return "; ".join(
-            filter(None, [*(text for text, files in amounts.items() if files), self.absent, *self.problems])
-        )
+        texts = (text for text, files in amounts.items() if files)
+        return "; ".join(filter(None, [*texts, self.absent, *self.problems]))
 
 
 def _amount(files: dict[Path, int]) -> str:

@@ -50,9 +50,7 @@ def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
     add("--size", type=_size, metavar="WIDTHxHEIGHT", help="pixels; the kind's own by default")
     text = "such as 1-40 or 1-20,41; default: all, but picture draws the rays of one ring, and c-arm shows the first"
     add("--modules", metavar="RANGE", help=text)
-    add(
-        "--position", type=float, nargs=3, default=[0.0, 0.0, 0.0], metavar="MM", help="of a phantom: its centre, x y z"
-    )
+    add("--position", type=float, nargs=3, default=[0.0] * 3, metavar="MM", help="of a phantom: its centre, x y z")
     text = "of a phantom: phi theta psi, psi about its own axis, then theta about world y, then phi about world z"
     add("--euler-degrees", type=float, nargs=3, default=[0.0, 0.0, 0.0], metavar="DEG", help=text)
     add("--voxels", type=int, default=200, metavar="N", help="of a phantom, along each side")
@@ -77,9 +75,8 @@ def _run(arguments: argparse.Namespace) -> None:
     """Draw or list figures."""
     if arguments.list:
         width = max(map(len, KINDS))
-        print(
-            "\n".join(f"{kind.name:{width}}  {kind.summary} (of {' and '.join(kind.needs)})" for kind in KINDS.values())
-        )
+        for kind in KINDS.values():
+            print(f"{kind.name:{width}}  {kind.summary} (of {' and '.join(kind.needs)})")
         return
     if arguments.kind is None:
         raise mph.InputError("figure: name a kind; --list shows them")

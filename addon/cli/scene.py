@@ -24,9 +24,8 @@ INSTALL_BLENDER = 'pip install "mphdrr[blender]", or ".[blender]" in its source;
 
 def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
     """Add the command."""
-    parser = add_command(
-        subparsers, "scene", COMMANDS[__name__], "mphdrr scene scanner.xlsx --run run.h5 -o scanner.blend"
-    )
+    example = "mphdrr scene scanner.xlsx --run run.h5 -o scanner.blend"
+    parser = add_command(subparsers, "scene", COMMANDS[__name__], example)
     add_workbook(parser)
     add = parser.add_argument
     add("--modules", metavar="RANGE", help="such as 1-40 or 1-20,41; default: all")
@@ -73,10 +72,9 @@ def new_scene() -> bpy.types.Scene:
     except ModuleNotFoundError:
         raise mph.InputError(f"this command needs Blender: {INSTALL_BLENDER}") from None
     except ImportError as error:  # a shared library is missing
-        raise mph.InputError(
-            f"Blender's bpy package does not load ({error}); on Debian and Ubuntu install libx11-6 libxi6 libxfixes3 "
-            "libxrender1 libxkbcommon0 libsm6 libgl1"
-        ) from None
+        libraries = "libx11-6 libxi6 libxfixes3 libxrender1 libxkbcommon0 libsm6 libgl1"
+        remedy = f"on Debian and Ubuntu install {libraries}"
+        raise mph.InputError(f"Blender's bpy package does not load ({error}); {remedy}") from None
     from .. import registration
 
     bpy.ops.wm.read_homefile(use_empty=True)

@@ -31,14 +31,10 @@ RECIPE = recipe_property()
 FOLDER = path_property(
     "Folder", "Folder of the event set: its recipe, index and a file for each event", "SKIP_SAVE", subtype="DIR_PATH"
 )
-COUNT = IntProperty(
-    name="Events", description="Number of events of the whole set; existing ones stay as they are", default=10,
-    min=1, soft_max=10000, options={"SKIP_SAVE"},
-)  # fmt: skip
-MODEL = StringProperty(
-    name="Model", description="Model whose projections are shown; empty: the recipe's first", search=_models,
-    search_options={"SUGGESTION"}, options={"SKIP_SAVE"},
-)  # fmt: skip
+COUNT = IntProperty(name="Events", description="Number of events of the whole set; existing ones stay as they are",
+                    default=10, min=1, soft_max=10000, options={"SKIP_SAVE"})  # fmt: skip
+MODEL = StringProperty(name="Model", description="Model whose projections are shown; empty: the recipe's first",
+                       search=_models, search_options={"SUGGESTION"}, options={"SKIP_SAVE"})  # fmt: skip
 
 
 def number_property(description: str) -> Any:
@@ -59,14 +55,10 @@ class EventProperties(bpy.types.PropertyGroup):
     count: COUNT
     opened: OPENED
     model: MODEL
-    phantom: PointerProperty(
-        name="Phantom", description="Phantom on which events are tried", type=bpy.types.Object,
-        poll=lambda self, item: volumes.is_volume(item), options={"HIDDEN"},
-    )  # fmt: skip
-    truth: PointerProperty(
-        name="Truth", description="Truth of the event that was opened last", type=bpy.types.Object,
-        poll=lambda self, item: volumes.is_volume(item), options={"HIDDEN"},
-    )  # fmt: skip
+    phantom: PointerProperty(name="Phantom", description="Phantom on which events are tried", type=bpy.types.Object,
+                             poll=lambda self, item: volumes.is_volume(item), options={"HIDDEN"})  # fmt: skip
+    truth: PointerProperty(name="Truth", description="Truth of the event that was opened last", type=bpy.types.Object,
+                           poll=lambda self, item: volumes.is_volume(item), options={"HIDDEN"})  # fmt: skip
     proposed: path_property("Proposed Folder", "Folder proposed for the recipe", "HIDDEN", subtype="DIR_PATH")
     tried: StringProperty(name="Tried", description="Event that the phantom in the scene shows", options={"HIDDEN"})
 

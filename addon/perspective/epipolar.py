@@ -108,9 +108,8 @@ def required_views(scene: bpy.types.Scene) -> RunViews:
         return run
     if not images.belong_to(scene):
         raise InputError("the projections are of another scene: render this one's first")
-    raise InputError(
-        "the shown run was kept by an earlier version, without its views: show it anew, or render it again"
-    )
+    advice = "show it anew, or render it again"
+    raise InputError(f"the shown run was kept by an earlier version, without its views: {advice}")
 
 
 def picked_pixel(scene: bpy.types.Scene) -> PickedPixel | None:
@@ -161,9 +160,8 @@ def _trace_pixel(run: RunViews, module: int, column: float, row: float, k: float
     n_v, n_u = views.shape
     pixel = np.array([column, row])
     if not _is_in_image(pixel, views.shape):
-        raise InputError(
-            f"column {column:g}, row {row:g}: the images have columns 0 to {n_u - 1} and rows 0 to {n_v - 1}"
-        )
+        limits = f"columns 0 to {n_u - 1} and rows 0 to {n_v - 1}"
+        raise InputError(f"column {column:g}, row {row:g}: the images have {limits}")
     if not k > 0:
         raise InputError(f"k = {k:g}: expected more than 0")
     detector, _, near, far = run.depths(index)

@@ -16,18 +16,13 @@ _UNIFORM = (
 class PerspectiveSettings:
     """Properties of a module's own coordinates, shared by the scene's settings (the panel) and the operators."""
 
-    planes: IntProperty(
-        name="Planes", description="Number of planes; each shows the volume's mean along the rays in its layer", default=12,
-        min=1, soft_max=32, max=256,
-    )  # fmt: skip
-    uniform: EnumProperty(
-        name="Evenly In", description="Coordinate in which the layers are evenly spaced", items=choices.items({}, _UNIFORM),
-        default="K",
-    )  # fmt: skip
-    cells: IntProperty(
-        name="Cells in Depth", description="Number of layers of cells, with a cell for every pixel",
-        default=64, min=1, soft_max=256, max=2048,
-    )  # fmt: skip
+    planes: IntProperty(name="Planes",
+                        description="Number of planes; each shows the volume's mean along the rays in its layer",
+                        default=12, min=1, soft_max=32, max=256)  # fmt: skip
+    uniform: EnumProperty(name="Evenly In", description="Coordinate in which the layers are evenly spaced",
+                          items=choices.items({}, _UNIFORM), default="K")  # fmt: skip
+    cells: IntProperty(name="Cells in Depth", description="Number of layers of cells, with a cell for every pixel",
+                       default=64, min=1, soft_max=256, max=2048)  # fmt: skip
 
 
 class PerspectiveProperties(PerspectiveSettings, bpy.types.PropertyGroup):
@@ -60,22 +55,18 @@ class EpipolarProperties(bpy.types.PropertyGroup):
         name="Views", description="Views in which the pixel was picked; empty: none is picked", options={"HIDDEN"}
     )
     module: IntProperty(name="Module", description="Number of the pixel's module", update=on_edit("epipolar"))
-    column: FloatProperty(
-        name="Column", description="Column of the pixel as in the arrays, along +u; 0: the centre of pixel 0", step=100,
-        precision=2, update=on_edit("epipolar"),
-    )  # fmt: skip
-    row: FloatProperty(
-        name="Row", description="Row of the pixel as in the arrays, along +v; 0: the centre of pixel 0", step=100,
-        precision=2, update=on_edit("epipolar"),
-    )  # fmt: skip
+    column: FloatProperty(name="Column",
+                          description="Column of the pixel as in the arrays, along +u; 0: the centre of pixel 0",
+                          step=100, precision=2, update=on_edit("epipolar"))  # fmt: skip
+    row: FloatProperty(name="Row", description="Row of the pixel as in the arrays, along +v; 0: the centre of pixel 0",
+                       step=100, precision=2, update=on_edit("epipolar"))  # fmt: skip
     k: FloatProperty(
         name="k", description="Magnification of the marker in the picked module: the virtual detector's distance from the "
         "pinhole over the marker's depth", default=1.0, min=1e-6, step=1, precision=4, update=on_edit("epipolar"),
     )  # fmt: skip
-    along: FloatProperty(
-        name="Along Ray", description="Position of the marker, evenly in k: 0 at the front of the ROI, 1 at its back",
-        subtype="FACTOR", min=0.0, max=1.0, get=_along, set=_set_along,
-    )  # fmt: skip
+    along: FloatProperty(name="Along Ray",
+                         description="Position of the marker, evenly in k: 0 at the front of the ROI, 1 at its back",
+                         subtype="FACTOR", min=0.0, max=1.0, get=_along, set=_set_along)  # fmt: skip
 
 
 CLASSES = (PerspectiveProperties, EpipolarProperties)

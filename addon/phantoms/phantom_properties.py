@@ -286,10 +286,8 @@ class VolumeProperties(bpy.types.PropertyGroup):
     """Properties of a volume, `Object.mphdrr_volume`, with the settings of every kind of phantom (`.derenzo`, ...)."""
 
     is_volume: BoolProperty(options={"HIDDEN"})
-    kind: EnumProperty(
-        name="Kind", description="Kind of the phantom whose settings are used", default="VOLUME",
-        items=choices.items(choices.KINDS, _KINDS),
-    )  # fmt: skip
+    kind: EnumProperty(name="Kind", description="Kind of the phantom whose settings are used", default="VOLUME",
+                       items=choices.items(choices.KINDS, _KINDS))  # fmt: skip
     with_parent: BoolProperty(options={"HIDDEN"})  # another quantity of the phantom that is the parent
     outdated: BoolProperty(options={"HIDDEN"})  # the phantom's settings have changed since its voxels were made
     recipe: StringProperty(options={"HIDDEN"})  # settings of a map, JSON
@@ -312,10 +310,8 @@ class VolumeProperties(bpy.types.PropertyGroup):
     display_high: FloatProperty(
         name="High", description="Value with the brightest colour", default=1.0, update=on_edit("display_range")
     )
-    look: EnumProperty(
-        name="Look", description="How the volume is drawn", items=choices.items({}, LOOKS), default="DENSITY",
-        update=on_edit("look"),
-    )  # fmt: skip
+    look: EnumProperty(name="Look", description="How the volume is drawn", items=choices.items({}, LOOKS),
+                       default="DENSITY", update=on_edit("look"))  # fmt: skip
     surface: FloatProperty(
         name="Surface", description="Value at which the surface is drawn", update=on_edit("display_range")
     )

@@ -23,54 +23,43 @@ _PLANES = (
 class DisplayProperties(bpy.types.PropertyGroup):
     """Colours, window and planes with which the last run's projections are shown; the exact numbers stay."""
 
-    colors: EnumProperty(
-        name="Colors", description="Colours of the numbers; all but grey are perceptually uniform",
-        items=choices.items({}, ((name.upper(), name.capitalize(), "") for name in COLORS)),
-        default="INFERNO", update=updates.on_edit("display"),
-    )  # fmt: skip
-    scale: EnumProperty(
-        name="Scale", description="Relation between numbers and colours",
-        items=choices.items({}, ((name.upper(), *_SCALE_TEXTS[name]) for name in SCALES)),
-        default="LINEAR", update=updates.on_edit("display"),
-    )  # fmt: skip
-    automatic: BoolProperty(
-        name="Automatic", description="Show the numbers from 0, or from the smallest, to the largest", default=True,
-        update=updates.on_edit("display"),
-    )  # fmt: skip
+    colors: EnumProperty(name="Colors", description="Colours of the numbers; all but grey are perceptually uniform",
+                         items=choices.items({}, ((name.upper(), name.capitalize(), "") for name in COLORS)),
+                         default="INFERNO", update=updates.on_edit("display"))  # fmt: skip
+    scale: EnumProperty(name="Scale", description="Relation between numbers and colours",
+                        items=choices.items({}, ((name.upper(), *_SCALE_TEXTS[name]) for name in SCALES)),
+                        default="LINEAR", update=updates.on_edit("display"))  # fmt: skip
+    automatic: BoolProperty(name="Automatic",
+                            description="Show the numbers from 0, or from the smallest, to the largest", default=True,
+                            update=updates.on_edit("display"))  # fmt: skip
     low: FloatProperty(
         name="Low", description="Number with the first colour", default=0.0, update=updates.on_edit("display")
     )
     high: FloatProperty(
         name="High", description="Number with the last colour", default=1.0, update=updates.on_edit("display")
     )
-    half: BoolProperty(
-        name="Central Half", description="Show the middle half of each image, often called FOV; all of it is the wide FOV",
-        update=updates.on_edit("display"),
-    )  # fmt: skip
-    planes: EnumProperty(
-        name="Planes", description="Modules whose projections stand in the scene",
-        items=choices.items({}, _PLANES), default="ALL", update=updates.on_edit("planes"),
-    )  # fmt: skip
-    plane_distance: FloatProperty(
-        name="Distance", description="Distance of the planes from the pinholes, mm; 0: automatic", min=0.0,
-        soft_max=500.0, update=updates.on_edit("planes"),
-    )  # fmt: skip
+    half: BoolProperty(name="Central Half",
+                       description="Show the middle half of each image, often called FOV; all of it is the wide FOV",
+                       update=updates.on_edit("display"))  # fmt: skip
+    planes: EnumProperty(name="Planes", description="Modules whose projections stand in the scene",
+                         items=choices.items({}, _PLANES), default="ALL", update=updates.on_edit("planes"))  # fmt: skip
+    plane_distance: FloatProperty(name="Distance",
+                                  description="Distance of the planes from the pinholes, mm; 0: automatic", min=0.0,
+                                  soft_max=500.0, update=updates.on_edit("planes"))  # fmt: skip
     preview_place: FloatVectorProperty(
         name="Preview's Place", description="Position of the live preview in the 3D views, 0 to 1 to the right and up",
         size=2, default=(1.0, 0.0), min=0.0, max=1.0, options={"HIDDEN"},
     )  # fmt: skip
-    plane_at_detector: BoolProperty(
-        name="At Virtual Detector", description="Put the planes at the virtual detectors, behind the ROI",
-        update=updates.on_edit("planes"),
-    )  # fmt: skip
+    plane_at_detector: BoolProperty(name="At Virtual Detector",
+                                    description="Put the planes at the virtual detectors, behind the ROI",
+                                    update=updates.on_edit("planes"))  # fmt: skip
     plane_opacity: FloatProperty(
         name="Opacity", description="Opacity of the planes and of pictures in the cameras' views", subtype="FACTOR", min=0.0,
         max=1.0, default=1.0, update=updates.on_edit("planes"),
     )  # fmt: skip
-    backgrounds: BoolProperty(
-        name="In Camera Views", description="Lay each projection over the view of its module's camera", default=True,
-        update=updates.on_edit("planes"),
-    )  # fmt: skip
+    backgrounds: BoolProperty(name="In Camera Views",
+                              description="Lay each projection over the view of its module's camera", default=True,
+                              update=updates.on_edit("planes"))  # fmt: skip
 
     @property
     def problem(self) -> str:

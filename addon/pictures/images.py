@@ -55,9 +55,8 @@ def make_pictures(run: ProjectionRun, display: Display, progress: Progress | Non
     exact = _make_all(exr_bytes, as_seen(run.projections), part_of(progress, 0, 2))
     rings = run.system.rings().tolist()
     colored = _color(run.projections, display, part_of(progress, 1, 2))
-    return Pictures(
-        display, exact, colored, *_draw_mosaic(run.projections, module_labels(run), rings, run.unit, display)
-    )
+    mosaic, layout = _draw_mosaic(run.projections, module_labels(run), rings, run.unit, display)
+    return Pictures(display, exact, colored, mosaic, layout)
 
 
 def store_images(run: ProjectionRun, files: Pictures) -> Generator[tuple[str, int, int] | None, None, bpy.types.Image]:

@@ -104,10 +104,8 @@ def panel_properties(settings: ReconstructionProperties) -> Iterator[tuple[str, 
 class ReconstructionProperties(ReconstructionSettings, bpy.types.PropertyGroup):
     """State of the Reconstruction panel; `Scene.mphdrr_reconstruction`."""
 
-    volume: PointerProperty(
-        name="Reconstruction", description="The last reconstructed volume", type=bpy.types.Object,
-        poll=lambda self, item: volumes.is_volume(item), options={"HIDDEN"},
-    )  # fmt: skip
+    volume: PointerProperty(name="Reconstruction", description="The last reconstructed volume", type=bpy.types.Object,
+                            poll=lambda self, item: volumes.is_volume(item), options={"HIDDEN"})  # fmt: skip
     mu: PointerProperty(
         name="Attenuation", description="Volume of attenuation coefficients (1/mm) or CT numbers for counts, in place of "
         "that which the run was made with; empty: the run's", type=bpy.types.Object,

@@ -90,13 +90,11 @@ def continue_job(context: bpy.types.Context) -> jobs.Job:
     if run is None:
         raise InputError(f"the run that it is of ({file}) has left the list of runs: reconstruct again")
     values, extent = reconstruction.volume.array, item.mphdrr_volume.extent
-    stored = stored_volumes.StoredVolume(
-        (reconstruction.volume,), volumes.pose_of_object(item), storage.absolute(item.data.filepath),
-        float(values.min()), float(values.max()), extent,
-    )  # fmt: skip
-    recipe = recipe_from_tables(reconstruction.settings["recipe"]).updated(
-        {"reconstruction.iterations": MORE_ITERATIONS}
-    )
+    stored = stored_volumes.StoredVolume((reconstruction.volume,), volumes.pose_of_object(item),
+                                         storage.absolute(item.data.filepath), float(values.min()), float(values.max()),
+                                         extent)  # fmt: skip
+    recipe = recipe_from_tables(reconstruction.settings["recipe"])
+    recipe = recipe.updated({"reconstruction.iterations": MORE_ITERATIONS})
     previous = _PreviousResult(item.session_uid, reconstruction, stored)
     return _make_job(context, recipe, rendering.run_file_path(run.file), run.name, previous)
 
@@ -298,7 +296,6 @@ def _read_mu(
     if name is None or run.recipe["model.kind"] != "emission" or recipe["reconstruction.ignore_attenuation"]:
         return None
     if name not in readers:
-        raise InputError(
-            f"the run's attenuation {name!r} is not in the scene any more: choose Ignore Attenuation, or render"
-        )
+        advice = "choose Ignore Attenuation, or render"
+        raise InputError(f"the run's attenuation {name!r} is not in the scene any more: {advice}")
     return readers[name]()

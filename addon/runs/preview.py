@@ -163,9 +163,8 @@ def _corners(views: Views, shape: tuple[int, ...], share: float) -> NDArray[np.f
     n_v, n_u = shape
     u, v = 0.5 * n_u * views.u_steps[0], 0.5 * n_v * views.v_steps[0]
     source, center = views.sources[0], views.detector_centers[0]
-    return np.stack(
-        [source + share * (center + x * u + y * v - source) for x, y in ((1, 1), (-1, 1), (-1, -1), (1, -1))]
-    )
+    signs = (1, 1), (-1, 1), (-1, -1), (1, -1)
+    return np.stack([source + share * (center + x * u + y * v - source) for x, y in signs])
 
 
 def _cache_key(request: Request) -> tuple[str, ...]:

@@ -197,14 +197,10 @@ def _project_all(self: ProjectionProperties, value: bool) -> None:
 class ProjectionProperties(ProjectionSettings, bpy.types.PropertyGroup):
     """State of the Projections panel; `Scene.mphdrr_projections`."""
 
-    volume: PointerProperty(
-        name="Volume", description="Volume to project; empty: the active volume, or the only one", type=bpy.types.Object,
-        poll=_is_ours, update=_volume_chosen,
-    )  # fmt: skip
-    all_modules: BoolProperty(
-        name="All Modules", description="Project into every module, not a range of numbers",
-        get=_projects_all, set=_project_all,
-    )  # fmt: skip
+    volume: PointerProperty(name="Volume", description="Volume to project; empty: the active volume, or the only one",
+                            type=bpy.types.Object, poll=_is_ours, update=_volume_chosen)  # fmt: skip
+    all_modules: BoolProperty(name="All Modules", description="Project into every module, not a range of numbers",
+                              get=_projects_all, set=_project_all)  # fmt: skip
     fitted: StringProperty(
         name="Fitted Model", description="Model chosen for the volume's quantity", options={"HIDDEN"}
     )

@@ -10,10 +10,9 @@ from pathlib import Path
 from typing import Any
 
 import bpy
-import numpy as np
-from numpy.typing import NDArray
 
 from ...core import ProjectionRun, Recipe, memory, read_recipe, read_run, write_run
+from ...core.arrays import Floats
 from ...core.errors import InputError, warn
 from ...core.geometry.system import chosen_modules
 from ...core.progress import Progress, Stages, stages_of
@@ -325,9 +324,7 @@ def _with_volume(recipe: Recipe, item: bpy.types.Object) -> Recipe:
     return recipe if settings is None else with_settings(recipe, settings, volumes.pose_of_object(item), number)
 
 
-def with_settings(
-    recipe: Recipe, settings: phantoms.PhantomSettings, pose: NDArray[np.float64], state: int = 0
-) -> Recipe:
+def with_settings(recipe: Recipe, settings: phantoms.PhantomSettings, pose: Floats, state: int = 0) -> Recipe:
     """Return the recipe with a phantom of these settings, at a world-from-phantom pose (4, 4), mm, in a state from 0."""
     job = phantoms.copy_settings(settings)
     values: dict[str, Any] = {

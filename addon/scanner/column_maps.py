@@ -66,10 +66,9 @@ class ColumnMapTable(bpy.types.PropertyGroup):
     """Rows of a sheet (`MappedTable`)."""
 
     sheet: StringProperty(name="Sheet", description="Name of the sheet", search=_sheets, update=_edited)
-    header_row: IntProperty(
-        name="Header Row", description="Row of the headings shown below, which are not read; 0: none", min=0,
-        update=_edited,
-    )  # fmt: skip
+    header_row: IntProperty(name="Header Row",
+                            description="Row of the headings shown below, which are not read; 0: none", min=0,
+                            update=_edited)  # fmt: skip
     first_row: IntProperty(name="First Row", description="Row of the first module", default=2, min=1, update=_edited)
     last_row: IntProperty(name="Last Row", description="Row of the last module", default=2, min=1, update=_edited)
     skip_rows: StringProperty(
@@ -97,10 +96,8 @@ class ColumnMapQuantity(bpy.types.PropertyGroup):
     table: IntProperty(name="Table", description="Table with the quantity's column", default=1, min=1, max=MAX_TABLES,
                        update=_edited)  # fmt: skip
     column: StringProperty(name="Column", description="The column's letters. Empty: none", update=_edited)
-    unit: EnumProperty(
-        name="Unit", description="Unit of the numbers in the column",
-        items=_units(LENGTH_UNITS, ANGLE_UNITS), default="NONE", update=_edited,
-    )  # fmt: skip
+    unit: EnumProperty(name="Unit", description="Unit of the numbers in the column",
+                       items=_units(LENGTH_UNITS, ANGLE_UNITS), default="NONE", update=_edited)  # fmt: skip
     seen: StringProperty(name="Seen", description="The column's heading and first number in the workbook")
 
 
@@ -111,14 +108,11 @@ class ColumnMapProperties(bpy.types.PropertyGroup):
     workbook: StringProperty(name="Workbook", description="Workbook that the settings belong to", subtype="FILE_PATH")
     sheets: StringProperty(name="Sheets", description="Names of the workbook's sheets, JSON", options={"HIDDEN"})
     doubts: StringProperty(name="Doubts", description="What the reader did not understand, JSON", options={"HIDDEN"})
-    n_tables: IntProperty(
-        name="Tables", description="Ranges of rows: the first holds x1, y1 and z1, the others dimensions",
-        default=2, min=1, max=MAX_TABLES, update=_number_of_tables_changed,
-    )  # fmt: skip
-    unit: EnumProperty(
-        name="All Lengths In", description="Unit for every length below",
-        items=_units(LENGTH_UNITS), default="NONE", update=_unit_of_all_changed,
-    )  # fmt: skip
+    n_tables: IntProperty(name="Tables",
+                          description="Ranges of rows: the first holds x1, y1 and z1, the others dimensions", default=2,
+                          min=1, max=MAX_TABLES, update=_number_of_tables_changed)  # fmt: skip
+    unit: EnumProperty(name="All Lengths In", description="Unit for every length below", items=_units(LENGTH_UNITS),
+                       default="NONE", update=_unit_of_all_changed)  # fmt: skip
     tables: CollectionProperty(type=ColumnMapTable, name="Tables")
     quantities: CollectionProperty(type=ColumnMapQuantity, name="Quantities")
     save_as: StringProperty(

@@ -236,9 +236,7 @@ def _is_outdated(data: bpy.types.Mesh, text: str) -> bool:
     return data.users == 1 and not data.is_editmode and data.get(_KEY) != text
 
 
-def _update_totals(
-    kind: ScannerType, scanner: bpy.types.PropertyGroup, modules: Sequence[bpy.types.PropertyGroup]
-) -> None:
+def _update_totals(kind: ScannerType, scanner: bpy.types.PropertyGroup, modules: list[bpy.types.PropertyGroup]) -> None:
     """Write the readouts of all modules together, and the values that they share."""
     scanner.count, scanner.findings = len(modules), ""
     pinholes.write_totals(scanner, [module for module in modules if not module.problem])

@@ -146,10 +146,8 @@ def duplicate_modules(
         poses = _copied_poses(collection, camera, module, angles, follow_ring)
         for pose in poses:
             if np.linalg.norm(np.array(positions) - pose[:3, 3], axis=1).min() < 1e-3:
-                raise InputError(
-                    f"a copy of module {camera.mphdrr_module.number} would stand in the place of another module: "
-                    "choose another angle or count"
-                )
+                place, advice = "in the place of another module", "choose another angle or count"
+                raise InputError(f"a copy of module {camera.mphdrr_module.number} would stand {place}: {advice}")
             positions.append(pose[:3, 3])
             copies.append((camera, module_values.with_formula_values(camera, module.at_poses(pose[None]))))
     copies_ = []

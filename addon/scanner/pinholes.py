@@ -83,10 +83,8 @@ def write_readouts(
 
 def _readouts(system: PinholeSystem, optics: Optics) -> NDArray[np.float64]:
     """Return the `_READOUTS` of the modules at the isocentre, (M, 4)."""
-    performance = isocentre_performance(
-        system.pinhole_distance, system.pinhole_diameter, system.collimator_length, system.detector_side,
-        system.detector_thickness, optics=optics,
-    )  # fmt: skip
+    performance = isocentre_performance(system.pinhole_distance, system.pinhole_diameter, system.collimator_length,
+                                        system.detector_side, system.detector_thickness, optics=optics)  # fmt: skip
     counts, fwhm, magnification, roi_seen = performance
     if system.tilt.any():  # without tilt, the dimensions alone suffice, which is faster
         counts, roi_seen = sensitivity(system, np.zeros((1, 3)))[0], system.roi_radius_seen()

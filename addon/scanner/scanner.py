@@ -233,10 +233,8 @@ def read_scanner(collection: bpy.types.Collection) -> Scanner:
     for camera in cameras_:
         first = by_number.setdefault(camera.mphdrr_module.number, camera)
         if first is not camera:
-            raise InputError(
-                f"'{first.name}' and '{camera.name}' both have module number {camera.mphdrr_module.number}: "
-                f"press Tidy Modules in the Design panel, or delete one"
-            )
+            number, advice = camera.mphdrr_module.number, "press Tidy Modules in the Design panel, or delete one"
+            raise InputError(f"'{first.name}' and '{camera.name}' both have module number {number}: {advice}")
     is_added = any(camera.mphdrr_module.added for camera in cameras_)
     is_complete = len(cameras_) == collection.mphdrr_scanner.n_modules and not is_added
     as_imported = is_complete and not any(map(any, changed_modules(cameras_)))
@@ -318,9 +316,8 @@ def show_modules(collection: bpy.types.Collection, first: int, last: int, mode: 
     chosen = {o for o in cameras_ if mode == "ALL" or first <= o.mphdrr_module.number <= last}
     if not chosen:
         numbers = [o.mphdrr_module.number for o in cameras_] or [0]
-        raise InputError(
-            f"no module between {first} and {last}: '{collection.name}' has {min(numbers)} to {max(numbers)}"
-        )
+        span = f"{min(numbers)} to {max(numbers)}"
+        raise InputError(f"no module between {first} and {last}: '{collection.name}' has {span}")
     for camera, parts in following.parts_of(collection, cameras_).items():
         if camera in chosen or mode == "ONLY":
             _set_hidden([camera, *parts], mode == "HIDE" or camera not in chosen)

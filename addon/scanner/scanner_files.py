@@ -40,9 +40,8 @@ def export_workbook_job(collection: bpy.types.Collection, path: Path, use_templa
             written = workbook.read_scanner(path, system.kind, written_columns)
         difference = _difference(system, written)
         if difference:
-            raise InputError(
-                f"{path}: was written, but reads back differently ({difference}); the scene keeps its numbers"
-            )
+            problem = f"was written, but reads back differently ({difference})"
+            raise InputError(f"{path}: {problem}; the scene keeps its numbers")
         # The scene keeps its own float64 numbers, from which the workbook's may differ in the last digit.
         return system.replace(source=written.source)
 
@@ -93,10 +92,8 @@ def _template_workbook(collection: bpy.types.Collection) -> Path | None:
         warn(f"{path} has gone: made a new workbook instead of a copy of it")
         return None
     if properties.sha256 and hashlib.sha256(path.read_bytes()).hexdigest() != properties.sha256:
-        warn(
-            f"{path} has changed since the scanner was read from it: the modules' cells are overwritten, all else is "
-            "kept as it is now"
-        )
+        effect = "the modules' cells are overwritten, all else is kept as it is now"
+        warn(f"{path} has changed since the scanner was read from it: {effect}")
     return path
 
 

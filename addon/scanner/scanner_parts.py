@@ -20,9 +20,8 @@ class NewScanner:
         self.cameras: dict[int, bpy.types.Object] = {}
         self.rings: list[bpy.types.Collection] = []
         self._named: list[tuple[bpy.types.ID, str]] = []  # names to give once the old scanner is gone
-        self._materials = {
-            kind: collimators.part_material(kind) for kind in ("ROI", *(part.kind.upper() for part in parts))
-        }
+        kinds = ("ROI", *(part.kind.upper() for part in parts))
+        self._materials = {kind: collimators.part_material(kind) for kind in kinds}
         try:
             self._make_cameras(system)
             self._make_parts(system, parts)

@@ -150,9 +150,8 @@ def _paint(item: bpy.types.Object, plane: bpy.types.Object) -> None:
     array = _read_volume(item).array
     factor = volume_materials.display_unit(settings.quantity)[1]
     low, high = settings.display_low / factor, settings.display_high / factor
-    relative = (np.take(array, min(settings.slices[axis], array.shape[axis] - 1), axis).T - low) / max(
-        high - low, 1e-30
-    )
+    values = np.take(array, min(settings.slices[axis], array.shape[axis] - 1), axis).T
+    relative = (values - low) / max(high - low, 1e-30)
     shades = np.clip(relative * (_SHADES - 1), 0, _SHADES - 1).astype(np.uint8)
     image.pixels.foreach_set(color_table(settings.quantity, ramp)[shades].ravel())
     image.update()

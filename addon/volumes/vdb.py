@@ -197,9 +197,8 @@ def _grid_to_volume(grid: Any, quantity: str | None, unit: float) -> Volume:
         # The metadata outlive what other programs do to the transform and the voxels.
         if is_inside and np.allclose(transform, original, rtol=0, atol=1e-9 * np.abs(original).max()):
             array = _dense_values(grid, np.zeros(3, int), shape)
-            return Volume(
-                freeze(array[::-1].copy() if metadata["mphdrr_mirrored"] else array), Grid(shape, affine), quantity
-            )
+            array = array[::-1].copy() if metadata["mphdrr_mirrored"] else array
+            return Volume(freeze(array), Grid(shape, affine), quantity)
     if np.any(last < first):
         raise InputError(f"the grid {grid.name!r} has no active voxels")
     affine = np.diag([unit, unit, unit, 1.0]) @ _voxel_center_transform(grid, transform)

@@ -98,10 +98,9 @@ def _add_derenzo(parser: argparse.ArgumentParser) -> None:
 def _make_derenzo(arguments: argparse.Namespace) -> mph.Phantom:
     """Return the Derenzo phantom that the options describe."""
     radius, height = arguments.water
-    return mph.DerenzoPhantom(
-        arguments.radius, tuple(arguments.rods), arguments.height, arguments.activity, arguments.sectors,
-        cylinder_radius=radius, cylinder_height=height, background=arguments.background, altered=arguments.altered,
-    )  # fmt: skip
+    return mph.DerenzoPhantom(arguments.radius, tuple(arguments.rods), arguments.height, arguments.activity,
+                              arguments.sectors, cylinder_radius=radius, cylinder_height=height,
+                              background=arguments.background, altered=arguments.altered)  # fmt: skip
 
 
 def _make_shape_phantom(shape: Any, names: list[str], arguments: argparse.Namespace) -> mph.Phantom:

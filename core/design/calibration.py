@@ -322,20 +322,18 @@ def _make_result(views: Views, bundle: BundleAdjustment, x: Floats, spots: Spots
     spot_freedom, pixel_freedom = (2 * used - leverages).sum(axis=0), (seen * (freedom + 2) - leverages).sum(axis=0)
     sums = ((used * squared).sum(axis=0), spot_freedom), ((seen * (pearson + squared)).sum(axis=0), pixel_freedom)
     misfit, chi_square = (np.where(n > 0.5, total / np.maximum(n, 0.5), np.nan) for total, n in sums)
-    misfits = (
-        (seen & ~used).any(axis=0) | _is_improbable(misfit, spot_freedom) | _is_improbable(chi_square, pixel_freedom)
-    )
+    misfits = (seen & ~used).any(axis=0) | _is_improbable(misfit, spot_freedom)
+    misfits |= _is_improbable(chi_square, pixel_freedom)
     expected = spots.expected(lattice, (fitted.project_points() - lattice.first) / lattice.step)
     excess, total = ((seen[..., None, None] * w).sum(axis=0) for w in (spots.windows - expected, expected))
     further_names = {LENGTH: ("length",), OFFSET: ("offset u", "offset v")}
     names = (*_PARAMETERS, *(name for kind in bundle.fit for name in further_names[kind]))
     gauge = ("shift", "turn", "scale")[: len(bundle.gauge()) // 3 + len(bundle.gauge()) % 3]
     system = nominal.replace(centers=fitted.centers, tilt=fitted.tilt, collimator_length=fitted.length)
-    return Calibration(
-        system, nominal, _move_views(views, nominal, fitted), fitted.points, covariance[:, :6, :6], chi_square, misfit,
-        tuple(nominal.numbers[misfits].tolist()), used, names, np.sqrt(np.diagonal(covariance, axis1=1, axis2=2)), told,
-        gauge, fitted.offset, excess / np.sqrt(np.maximum(total, 1)),
-    )  # fmt: skip
+    return Calibration(system, nominal, _move_views(views, nominal, fitted), fitted.points, covariance[:, :6, :6],
+                       chi_square, misfit, tuple(nominal.numbers[misfits].tolist()), used, names,
+                       np.sqrt(np.diagonal(covariance, axis1=1, axis2=2)), told, gauge, fitted.offset,
+                       excess / np.sqrt(np.maximum(total, 1)))  # fmt: skip
 
 
 def _is_improbable(per_freedom: Floats, freedom: Floats) -> Bools:

@@ -101,9 +101,7 @@ class ModuleSeparation(Constraint):
         pair = [(rows[:, 15 * i : 15 * i + 15], system.detector_thickness[members[:, i]]) for i in (0, 1)]
         axes = np.concatenate([_hull_normals(*module) for module in pair], axis=1)
         first, second = (axes @ _hull_corners(*module).transpose(0, 2, 1) for module in pair)  # (N, axes, corners)
-        gaps = np.concatenate(
-            [-_smooth_max(-b) - _smooth_max(a) for a, b in ((first, second), (second, first))], axis=1
-        )
+        gaps = np.hstack([-_smooth_max(-b) - _smooth_max(a) for a, b in ((first, second), (second, first))])
         weights = np.exp((gaps - gaps.max(axis=1, keepdims=True)) / _SMOOTHING)
         return -(weights * gaps).sum(axis=1, keepdims=True) / weights.sum(axis=1, keepdims=True)
 

@@ -89,9 +89,8 @@ class ObjectiveSettings(Values):
         """Settings of this kind of objective, by key."""
         one_of(self.given.get("kind"), _OBJECTIVES, "kind")
         weight = Setting("weight", float, 1.0, "Weight, each objective being 1 at the start", above=0)
-        return settings_by_key(
-            (Setting("kind", str, None, "Kind of objective"), weight, *_OBJECTIVES[self.given["kind"]])
-        )
+        kind = Setting("kind", str, None, "Kind of objective")
+        return settings_by_key((kind, weight, *_OBJECTIVES[self.given["kind"]]))
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -209,9 +208,8 @@ class DesignRecipe(Values):
         """SHA-256 of all entries that determine the design, and of the contents of the files that they name."""
         irrelevant = ("pareto.", "evaluation.")
         entries = sorted((key, value) for key, value in self.given.items() if not key.startswith(irrelevant))
-        bodies = [
-            text for goal in self.goals.values() if "parts" in goal.rows for text in (*goal["body"], goal["parts"])
-        ]
+        goals = [goal for goal in self.goals.values() if "parts" in goal.rows]
+        bodies = [text for goal in goals for text in (*goal["body"], goal["parts"])]
         files = [text for text in (self.generator.get("file"), *bodies) if text and "\n" not in text]
         data = [read_bytes(self.folder / name) for name in files]
         return hashlib.sha256(repr((entries, self.generator, self.free, self.objectives, data)).encode()).hexdigest()

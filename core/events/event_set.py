@@ -243,10 +243,8 @@ class Event:
         image_model: Any = recipe_model(self._folder.recipe.placed(recipe), self.system)
         images = self.images(model, noise_seed, level)
         background = scale_by_module(image_model.background, recorded_shares(recipe, images))
-        return ProjectionRun(
-            images, self.system, self.views, self.truth, unit=self.unit(model), settings=settings, seed=noise_seed,
-            background=background, efficiency=image_model.efficiency,
-        )  # fmt: skip
+        return ProjectionRun(images, self.system, self.views, self.truth, unit=self.unit(model), settings=settings,
+                             seed=noise_seed, background=background, efficiency=image_model.efficiency)  # fmt: skip
 
     def _run_recipe(self, model: Recipe) -> Recipe | None:
         """Return the recipe of a run with a model's images; None where no recipe can describe the attenuation."""

@@ -178,12 +178,7 @@ def _make_in_turn(target: SetFolder, missing: Sequence[int], progress: Progress 
 
 
 def make(
-    recipe: EventRecipe,
-    folder: AnyPath,
-    count: int,
-    first: int = 0,
-    workers: int = 1,
-    progress: Progress | None = None,
+    recipe: EventRecipe, folder: AnyPath, count: int, first: int = 0, workers: int = 1, progress: Progress | None = None
 ) -> EventSet:
     """Make events `first` to ``first + count - 1`` of a recipe; events that the folder holds already are not made again.
 

@@ -84,46 +84,30 @@ _PICTURE = Studio(volume=True, rays=True, cut=True, near=1.25, lens=30.0, lit=Tr
 KINDS = {
     kind.name: kind
     for kind in (
-        FigureKind(
-            "scanner", "Scanner", "the scanner's modules, or some of them alone, in place", ("scanner",), (1600, 1000),
-            studio=Studio(),
-        ),
-        FigureKind(
-            "cut-away", "Cut-Away with Rays", "a volume and the principal rays, the modules in front of it cut away",
-            ("scanner", "volume"), (1600, 1000), studio=Studio(volume=True, rays=True, cut=True),
-        ),
-        FigureKind(
-            "inside", "Volume in the Scanner", "a volume seen from near by, between the modules", ("scanner", "volume"),
-            (1600, 1000), studio=Studio(volume=True, near=1.7),
-        ),
-        FigureKind(
-            "picture", "Picture", "a volume with its scale and colour bar, and the rays of chosen modules or of a ring",
-            ("scanner", "volume"), (2400, 1500), studio=_PICTURE,
-        ),
-        FigureKind(
-            "turntable", "Turntable", "the picture, once around: an animation", ("scanner", "volume"), (1280, 800),
-            studio=_PICTURE._replace(near=1.7), motion="turn",
-        ),
-        FigureKind(
-            "light-up", "Modules Light Up", "the picture, one module after the other with its ray: an animation",
-            ("scanner", "volume"), (1280, 800), studio=_PICTURE._replace(near=2.2), motion="light",
-        ),
-        FigureKind(
-            "sums", "Orthogonal Sums", "a volume's sums along x, y and z, value x mm, with its translation T and rotation R",
-            ("volume",), (1600, 680), sums.draw,
-        ),
-        FigureKind(
-            "mosaic", "Mosaic, FOV", "all projections ring by ring, the central half of each image", ("run",), (1800, 480),
-            mosaics.draw_fov,
-        ),
-        FigureKind(
-            "mosaic-wide", "Mosaic, Wide FOV", "all projections ring by ring, whole images", ("run",), (1800, 480),
-            mosaics.draw_wide_fov,
-        ),
-        FigureKind(
-            "c-arm", "Virtual C-Arm", "a module's distances, as the true pinhole and as a C-arm with its source 5 l away",
-            ("scanner",), (1600, 800), virtual_c_arm.draw, one_module=True,
-        ),
+        FigureKind("scanner", "Scanner", "the scanner's modules, or some of them alone, in place", ("scanner",),
+                   (1600, 1000), studio=Studio()),
+        FigureKind("cut-away", "Cut-Away with Rays",
+                   "a volume and the principal rays, the modules in front of it cut away", ("scanner", "volume"),
+                   (1600, 1000), studio=Studio(volume=True, rays=True, cut=True)),
+        FigureKind("inside", "Volume in the Scanner", "a volume seen from near by, between the modules",
+                   ("scanner", "volume"), (1600, 1000), studio=Studio(volume=True, near=1.7)),
+        FigureKind("picture", "Picture",
+                   "a volume with its scale and colour bar, and the rays of chosen modules or of a ring",
+                   ("scanner", "volume"), (2400, 1500), studio=_PICTURE),
+        FigureKind("turntable", "Turntable", "the picture, once around: an animation", ("scanner", "volume"),
+                   (1280, 800), studio=_PICTURE._replace(near=1.7), motion="turn"),
+        FigureKind("light-up", "Modules Light Up", "the picture, one module after the other with its ray: an animation",
+                   ("scanner", "volume"), (1280, 800), studio=_PICTURE._replace(near=2.2), motion="light"),
+        FigureKind("sums", "Orthogonal Sums",
+                   "a volume's sums along x, y and z, value x mm, with its translation T and rotation R", ("volume",),
+                   (1600, 680), sums.draw),
+        FigureKind("mosaic", "Mosaic, FOV", "all projections ring by ring, the central half of each image", ("run",),
+                   (1800, 480), mosaics.draw_fov),
+        FigureKind("mosaic-wide", "Mosaic, Wide FOV", "all projections ring by ring, whole images", ("run",),
+                   (1800, 480), mosaics.draw_wide_fov),
+        FigureKind("c-arm", "Virtual C-Arm",
+                   "a module's distances, as the true pinhole and as a C-arm with its source 5 l away", ("scanner",),
+                   (1600, 800), virtual_c_arm.draw, one_module=True),
     )
 }  # fmt: skip
 

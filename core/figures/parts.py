@@ -21,10 +21,8 @@ def heading(page: Page, title: str, lines: Sequence[str] = (), ink: str = INK, f
     """Write a title and lines of text below it; return the first free row."""
     em = page.em
     row, width = 0.9 * em, page.width - 2 * em
-    for text, size, step, color in (
-        (title, 1.25 * em, 1.2 * em, ink),
-        *((line, em, 1.45 * em, faint) for line in lines),
-    ):
+    texts = (title, 1.25 * em, 1.2 * em, ink), *((line, em, 1.45 * em, faint) for line in lines)
+    for text, size, step, color in texts:
         row += step
         # Lines that are too long are written smaller.
         page.text(text, em, row, size * min(1.0, width / max(letters.width(text, size), 1.0)), color)

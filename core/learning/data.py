@@ -209,9 +209,8 @@ def prepare_samples(
     InputWarning
         The samples take several gigabytes, or the events' voxels are not fine enough to learn from.
     """
-    for text in inverse_crime_notes(
-        source.run, source.recipe.grid, reconstruction_model(source.run, source.run.recipe)
-    ):
+    model = reconstruction_model(source.run, source.run.recipe)
+    for text in inverse_crime_notes(source.run, source.recipe.grid, model):
         warn(text)
     draws = [source.draws(split) for split in splits]
     folder = ensure_folder(parent / f"samples-{source.fingerprint[:16]}")

@@ -9,8 +9,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
+from ..arrays import Floats32
 from ..errors import InputError, naming
 from ..perspective.perspective_maps import PerspectiveMaps
 from ..projector import Projector
@@ -70,7 +70,7 @@ class ScannerSetup:
             A = Projector(A.grid, A.views[order], model, A.backend, A.threads)
         self.A, self.subsets, self.after, self._modules = A, subsets, tuple(after), model.system
         self.saved = 0.0
-        self._scans: dict[bytes, tuple[NDArray[np.float32], float]] = {}
+        self._scans: dict[bytes, tuple[Floats32, float]] = {}
 
     @cached_property
     def sensitivity(self) -> torch.Tensor:
@@ -93,16 +93,14 @@ class ScannerSetup:
         with naming("osem"):
             return Snapshots(self.A, self.subsets)
 
-    def sample(
-        self, counts: NDArray[np.float32], background: NDArray[np.float32], truth: NDArray[np.float32]
-    ) -> Sample:
+    def sample(self, counts: Floats32, background: Floats32, truth: Floats32) -> Sample:
         """Return a batch of one scan: counts and background (M, n_v, n_u), and the truth (n_x, n_y, n_z) on the grid."""
         osem = self._osem(counts, background)
         scale = float(np.sqrt(np.mean(np.square(osem[len(osem) // 2])))) or 1.0
         arrays = (counts, background, osem / scale, scale, truth / scale)
         return Sample(*(torch.as_tensor(np.asarray(array, np.float32))[None] for array in arrays))
 
-    def _osem(self, counts: NDArray[np.float32], background: NDArray[np.float32]) -> NDArray[np.float32]:
+    def _osem(self, counts: Floats32, background: Floats32) -> Floats32:
         """Return the OSEM volumes of a scan; those of the last scans are cached, since several networks may need them."""
         key, start = hashlib.sha256(counts.tobytes() + background.tobytes()).digest(), time.perf_counter()
         self.saved = self._scans[key][1] if key in self._scans else 0.0

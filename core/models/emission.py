@@ -428,10 +428,8 @@ class Emission(Model):
         is_bounded = self.within_crystal or self.within_walls
         sides = self.system.detector_side if is_bounded else np.full(len(self.system), np.inf)
         # The path through the edge, depths in the crystal and its side are not in the rays' weights: the response has them.
-        plain = replace(
-            self, within_crystal=False, within_walls=False, depth_layers=1, edge="paix", plate_thickness=None,
-            within_cone=self.within_cone or self.edge == "path",
-        )  # fmt: skip
+        plain = replace(self, within_crystal=False, within_walls=False, depth_layers=1, edge="paix",
+                        plate_thickness=None, within_cone=self.within_cone or self.edge == "path")  # fmt: skip
         sizes = zip(self.system.pinhole_diameter.tolist(), self.system.detector_thickness.tolist(), strict=True)
         effects = [DirectionalEffects.from_optics(self._optics_of(m), *size) for m, size in enumerate(sizes)]
         lengths = self.system.collimator_length + [module.mean_depth for module in effects]

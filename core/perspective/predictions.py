@@ -53,11 +53,7 @@ def spread_along_rays(image: ArrayOrTensor, distribution: ArrayOrTensor, g: Pers
 
 
 def predict_views(
-    array: ArrayOrTensor,
-    g: PerspectiveGrid,
-    views: Views,
-    planes: int | None = None,
-    progress: Progress | None = None,
+    array: ArrayOrTensor, g: PerspectiveGrid, views: Views, planes: int | None = None, progress: Progress | None = None
 ) -> tuple[ArrayOrTensor, ArrayOrTensor]:
     """Predict the images of other views from values in the coordinates of one view.
 

@@ -273,10 +273,9 @@ class DerenzoPhantom(Phantom):
     @cached_property
     def _rods(self) -> DerenzoRods:
         """Shape of the rods."""
-        return DerenzoRods(
-            radius=self.radius, rod_diameters=self.rod_diameters, height=self.height, sectors=self.sectors,
-            altered=self.altered, activity=self.activity, mu=self.mu, name="rods",
-        )  # fmt: skip
+        return DerenzoRods(radius=self.radius, rod_diameters=self.rod_diameters, height=self.height,
+                           sectors=self.sectors, altered=self.altered, activity=self.activity, mu=self.mu,
+                           name="rods")  # fmt: skip
 
     @property
     def _water_height(self) -> float:

@@ -59,11 +59,9 @@ class JaszczakPhantom(Phantom):
             Cylinder(radius=self.radius, height=self.height, activity=self.activity, mu=self.mu, name="water")
         ]
         if any(self.rod_diameters):
-            rods = DerenzoRods(
-                radius=self.radius, rod_diameters=self.rod_diameters, height=self.rod_height, name="rods",
-                position=(0, 0, base + self.rod_height / 2), activity=self.rod_activity,
-                mu=self.mu if self.rod_activity else plastic_mu,
-            )  # fmt: skip
+            rods = DerenzoRods(radius=self.radius, rod_diameters=self.rod_diameters, height=self.rod_height,
+                               name="rods", position=(0, 0, base + self.rod_height / 2), activity=self.rod_activity,
+                               mu=self.mu if self.rod_activity else plastic_mu)  # fmt: skip
             shapes.append(rods)
         positions = [(*xy, base + self.sphere_height) for xy in ring_positions(self.sphere_ring_radius, -90.0)]
         mu = self.mu if self.sphere_activity else plastic_mu

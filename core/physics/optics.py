@@ -206,12 +206,7 @@ class Optics:
         return [thickness * (layer / max(1, self.depth_layers - 1)) for layer in range(self.depth_layers)]
 
     def counted(
-        self,
-        slope_u: ArrayOrTensor,
-        slope_v: ArrayOrTensor,
-        opening: Opening,
-        thickness: ArrayOrTensor,
-        layer: int = 0,
+        self, slope_u: ArrayOrTensor, slope_v: ArrayOrTensor, opening: Opening, thickness: ArrayOrTensor, layer: int = 0
     ) -> tuple[ArrayOrTensor, ArrayOrTensor]:
         """Return the sensitivity law for one opening and one depth layer, mm^2, and the cosine of the angle to the axis.
 

@@ -114,15 +114,14 @@ def _run_voxels(
     matrix, fields = response.matrix, {"first": 0, "last": len(volume)} | fields
     shifts, line = np.ascontiguousarray(response.piece_offsets @ matrix[:, :3].T), matrix[:, :3] @ response.depth_line
     planes, rows, columns = response.shape
-    job = DepthJob(
-        is_double=cells.dtype == np.float64, volume=as_voxel_array(volume, cells, kernel is library.cells_to_voxels),
-        matrix=tuple(matrix.ravel().tolist()), line=tuple(line.tolist()), shifts=shifts.ctypes.data,
-        pieces=len(shifts), of_point=response.max_point_length, of_pair=response.max_pair_length,
-        parts_per_cell=response.samples_per_cell, nearest=response.nearest, farthest=response.farthest,
-        first_plane=response.first_plane, planes_per_inverse=response.planes_per_inverse_depth, cells=cells.ctypes.data,
-        passes=None if transmittance is None else transmittance.ctypes.data, planes=planes, rows=rows, columns=columns,
-        step=response.cells_per_pixel, **fields,
-    )  # fmt: skip
+    job = DepthJob(is_double=cells.dtype == np.float64,
+                   volume=as_voxel_array(volume, cells, kernel is library.cells_to_voxels),
+                   matrix=tuple(matrix.ravel().tolist()), line=tuple(line.tolist()), shifts=shifts.ctypes.data,
+                   pieces=len(shifts), of_point=response.max_point_length, of_pair=response.max_pair_length,
+                   parts_per_cell=response.samples_per_cell, nearest=response.nearest, farthest=response.farthest,
+                   first_plane=response.first_plane, planes_per_inverse=response.planes_per_inverse_depth,
+                   cells=cells.ctypes.data, passes=None if transmittance is None else transmittance.ctypes.data,
+                   planes=planes, rows=rows, columns=columns, step=response.cells_per_pixel, **fields)  # fmt: skip
     kernel(level, job)
 
 
@@ -145,10 +144,9 @@ def _run_pixels(
         nodes = {"nodes": kernels.shape[1:3], "node_rows": node_rows.ctypes.data,
                  "node_columns": node_columns.ctypes.data, "room": room.ctypes.data,
                  "columns_of": columns_of.ctypes.data}  # fmt: skip
-    job = DepthJob(
-        is_double=image.dtype == np.float64, cells=sorted_cells.ctypes.data, planes=planes, rows=rows, columns=columns,
-        kernel=kernels.ctypes.data, bounds=response.tap_bounds.ctypes.data, taps=response.kernels.shape[-2:],
-        step=response.cells_per_pixel, image=image.ctypes.data, row=image.strides[0] // image.itemsize,
-        pixels=response.pixel_weights.shape, gradient=None if gradient is None else gradient.ctypes.data, **nodes,
-    )  # fmt: skip
+    job = DepthJob(is_double=image.dtype == np.float64, cells=sorted_cells.ctypes.data, planes=planes, rows=rows,
+                   columns=columns, kernel=kernels.ctypes.data, bounds=response.tap_bounds.ctypes.data,
+                   taps=response.kernels.shape[-2:], step=response.cells_per_pixel, image=image.ctypes.data,
+                   row=image.strides[0] // image.itemsize, pixels=response.pixel_weights.shape,
+                   gradient=None if gradient is None else gradient.ctypes.data, **nodes)  # fmt: skip
     kernel(level, job)

@@ -82,9 +82,8 @@ class DepthResponse:
         used = self.padded_kernels != 0
         if self.node_positions is not None:
             used[:, :-1] |= used[:, 1:]
-        return np.stack([used.argmax(-1), used.shape[-1] - used[..., ::-1].argmax(-1)], -1) * used.any(
-            -1, keepdims=True
-        )
+        bounds = np.stack([used.argmax(-1), used.shape[-1] - used[..., ::-1].argmax(-1)], -1)
+        return bounds * used.any(-1, keepdims=True)
 
     def node_responses(self) -> Iterator[tuple[Index, DepthResponse, Block, Block]]:
         """Yield each node's number along v and u, the response by its kernel alone, and the pixels and cells concerned.
@@ -136,10 +135,9 @@ class DepthResponse:
         matrix[0] -= cells[1].start * matrix[2]
         matrix[1] -= cells[0].start * matrix[2]
         positions = self.node_positions
-        response = replace(
-            self, matrix=matrix, first_plane=self.first_plane + farther / self.planes_per_inverse_depth,
-            cell_weights=self.cell_weights[tuple(cells)], padded_kernels=self.padded_kernels[farther : nearer + 1],
-            pixel_weights=self.pixel_weights[tuple(pixels)],
-            node_positions=positions and (positions[0][pixels[0]], positions[1][pixels[1]]),
-        )  # fmt: skip
+        response = replace(self, matrix=matrix, first_plane=self.first_plane + farther / self.planes_per_inverse_depth,
+                           cell_weights=self.cell_weights[tuple(cells)],
+                           padded_kernels=self.padded_kernels[farther : nearer + 1],
+                           pixel_weights=self.pixel_weights[tuple(pixels)],
+                           node_positions=positions and (positions[0][pixels[0]], positions[1][pixels[1]]))  # fmt: skip
         return response, (pixels[0], pixels[1])

@@ -161,10 +161,9 @@ class PinholeViews:
         def point_weight(*, u: Array, v: Array) -> Array:
             return np.asarray(self.ray_weight(m, u=u, v=v) * np.sqrt(1 + (u**2 + v**2) / l**2))
 
-        return DepthZone(
-            numbers, self.views.shape, point_weight, float(self.crystal_sides[m]), self.grid.voxel_volume, pieces_per_edge,
-            near, far, planes, cells_per_pixel, sampling, pixel_exponent, effects, node_spacing,
-        )  # fmt: skip
+        return DepthZone(numbers, self.views.shape, point_weight, float(self.crystal_sides[m]), self.grid.voxel_volume,
+                         pieces_per_edge, near, far, planes, cells_per_pixel, sampling, pixel_exponent, effects,
+                         node_spacing)  # fmt: skip
 
     def _view_numbers(self, m: int, mean_depth: float) -> ViewNumbers:
         """Return the numbers of view m that responses depend on; `mean_depth` is that of interaction, mm."""

@@ -35,11 +35,9 @@ def zone_response(zone: DepthZone, dtype: type) -> DepthResponse:
     depth_line = depths / zone.pieces_per_edge / np.linalg.norm(depths)
     planes_per_inverse_depth = float((len(inverse_depths) - 1) / (inverse_depths[-1] - inverse_depths[0]))
     rows, columns = (np.arange(n) / zone.node_spacing for n in zone.image_shape)
-    return DepthResponse(
-        matrix, piece_offsets, depth_line, *zone.sampling, zone.near, zone.far, float(inverse_depths[0]),
-        planes_per_inverse_depth, cell_weights.astype(dtype), padded_kernels, cells, pixel_weights,
-        None if zone.effects is None else (rows, columns),
-    )  # fmt: skip
+    return DepthResponse(matrix, piece_offsets, depth_line, *zone.sampling, zone.near, zone.far,
+                         float(inverse_depths[0]), planes_per_inverse_depth, cell_weights.astype(dtype), padded_kernels,
+                         cells, pixel_weights, None if zone.effects is None else (rows, columns))  # fmt: skip
 
 
 def second_order_correction(zone: DepthZone, diameter: float, length: float, squared_edges: float) -> Array:

@@ -251,10 +251,8 @@ def emission_images(
     n = require_points(pixel_points, "emission images: pixel_points")
     if n is None:
         views = camera_views(positions, rotations, l, pitch, offset, (n_v, n_u))
-        edges, error = (
-            [shadow_edges(views, m, volume_grid) for m in range(len(views))],
-            positive(tolerance, "tolerance"),
-        )
+        edges = [shadow_edges(views, m, volume_grid) for m in range(len(views))]
+        error = positive(tolerance, "tolerance")
         n = max(points_needed(view_edges, error, aperture_points) for view_edges in edges)
     # Numbers of cameras get axes for rays, rows and columns: (..., 1, 1, 1).
     optics = optics.with_numbers({name: x[..., None, None, None] for name, x in named_numbers.items()})

@@ -191,9 +191,8 @@ class LeastSquaresLoop(Loop):
         instance(A, Projector, method)
         instance(nonnegative, bool, "nonnegative")
         quantity = "activity" if A.model.takes == ("activity",) else "mu"
-        super().__init__(
-            method, A, iterations, *options, **named, default=0.0, negative=not nonnegative, quantity=quantity
-        )
+        named |= {"default": 0.0, "negative": not nonnegative, "quantity": quantity}
+        super().__init__(method, A, iterations, *options, **named)
         self._nonnegative = nonnegative
         background = A.background.astype(np.float32)
         measured = real_array(numpy_if_tensor(images), "images", A.shape_out, np.float32) - background

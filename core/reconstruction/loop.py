@@ -192,10 +192,9 @@ class Loop:
         present = {**settings, "objective": last if objective is None else objective}
         changed = [f"{key} {expected[key]}, now {v}" for key, v in present.items() if not _are_equal(v, expected[key])]
         if changed:
-            raise InputError(
-                "start: this reconstruction is of other images, views or mask, or another model or other settings "
-                f"({'; '.join(changed)}): give its volume (--start) to begin with that"
-            )
+            difference = f"other images, views or mask, or another model or other settings ({'; '.join(changed)})"
+            advice = "give its volume (--start) to begin with that"
+            raise InputError(f"start: this reconstruction is of {difference}: {advice}")
 
     def _result(self, settings: Mapping[str, Any], stopped: str) -> Reconstruction:
         volume = Volume(self.values, self._A.grid, self._quantity)

@@ -85,9 +85,8 @@ def argument_settings(order: Iterable[str]) -> dict[str, Setting]:
             needs += [alternatives(key, takers)] if takers else []
             defaults |= {choice.label: choice.own[name] for choice in takers.values()}
         row, values = ARGUMENTS[name], set(defaults.values()) - {None, inspect.Parameter.empty}
-        listed = (
-            ": " + ", ".join(f"{label} {default:g}" for label, default in defaults.items()) if len(values) > 1 else ""
-        )
+        texts = ", ".join(f"{label} {default:g}" for label, default in defaults.items()) if len(values) > 1 else ""
+        listed = texts and f": {texts}"
         default = values.pop() if len(values) == 1 else None
         settings[name] = replace(row, default=default, absent=row.absent + listed, needs=(" or ".join(needs),))
     return settings

@@ -82,9 +82,7 @@ class Display:
         low, high = window
         numbers = np.asarray(values, np.float32)
         if self.scale == "log":
-            low, high = (
-                float(np.float32(end)) for end in window
-            )  # float32, as the numbers: small ones have few digits
+            low, high = np.array(window, np.float32).tolist()  # as the numbers, of which small ones have few digits
             if not 0 < low < high:
                 return (numbers >= high).astype(np.float32) if high > 0 else np.zeros_like(numbers)
             numbers = np.log(np.maximum(numbers, low, dtype=np.float32))

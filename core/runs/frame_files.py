@@ -157,10 +157,8 @@ def _reader(path: Path, ending: str) -> Callable[[Path, CountsLayout], Counts]:
         return _read_dicom
     header = path.with_suffix(".hdr")
     beside = f"its header {header.name}, which is beside it, or " if header.is_file() else ""
-    raise InputError(
-        f"expected {beside}a name ending in {', '.join(COUNTS_FORMATS)}; of raw numbers say the shape (--raw-shape "
-        "FRAMES ROWS COLUMNS) and the type (--raw-type uint16)"
-    )
+    raw = "of raw numbers say the shape (--raw-shape FRAMES ROWS COLUMNS) and the type (--raw-type uint16)"
+    raise InputError(f"expected {beside}a name ending in {', '.join(COUNTS_FORMATS)}; {raw}")
 
 
 def _checked_frames(array: Array, kind: str = "", **facts: Sequence[float]) -> Counts:

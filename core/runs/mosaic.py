@@ -136,9 +136,8 @@ def draw_sheet(
     bar = _color_bar(display, window, unit, height, max(size, height / 25))
     with_bar = np.concatenate([picture, bar], axis=1)
     share = visible.shape[2] / projections.shape[2], visible.shape[1] / projections.shape[1]
-    return MosaicSheet(
-        with_bar, corners, (n_v, n_u), window, word, values, visible.max(axis=(1, 2)), display.half, share
-    )
+    maxima = visible.max(axis=(1, 2))
+    return MosaicSheet(with_bar, corners, (n_v, n_u), window, word, values, maxima, display.half, share)
 
 
 def write_sheet(run: "ProjectionRun", path: AnyPath, display: Display | None = None) -> None:

@@ -167,10 +167,8 @@ def project_run(
         "pitch_mm": None if pitch is None else np.broadcast_to(pitch, 2).tolist(), "model": model.name, **model.record(),
         **({} if photons is None else {"photons": photons}), "backend": imaging.projector.backend, **(settings or {}),
     }  # fmt: skip
-    return ProjectionRun(
-        images, system, views, volume, unit=imaging.unit(volume), settings=record, seed=noise_seed,
-        background=scale_by_module(model.background, shares), efficiency=model.efficiency,
-    )  # fmt: skip
+    return ProjectionRun(images, system, views, volume, unit=imaging.unit(volume), settings=record, seed=noise_seed,
+                         background=scale_by_module(model.background, shares), efficiency=model.efficiency)  # fmt: skip
 
 
 def warn_of_energy(model: Model, energy: float | str | None, source: str) -> None:

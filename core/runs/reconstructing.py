@@ -96,10 +96,8 @@ def reconstruct_run(
     method = method or method_of(recipe["reconstruction.method"])
     if method.of_counts and recipe["model.kind"] != "emission":
         names = ", ".join(name for name, choice in METHODS.items() if not choice.of_counts)
-        raise InputError(
-            f"reconstruction.method: {recipe['reconstruction.method']} needs a run of counts, not of line integrals; for "
-            f"these images: {names}"
-        )
+        need = f"{recipe['reconstruction.method']} needs a run of counts, not of line integrals"
+        raise InputError(f"reconstruction.method: {need}; for these images: {names}")
     grid = reconstruction_grid(run, recipe, method)
     require(22.0 * grid.n_voxels, "a reconstruction of {} x {} x {} voxels".format(*grid.shape))
     rule = _stopping_rule(recipe, grid)

@@ -363,10 +363,9 @@ def read_mu(
     volume = read_volume_of(path, "mu", advice, series=series, progress=progress)
     lowest, highest = float(volume.array.min()), float(volume.array.max())
     if lowest < -1 or highest > _MOST_MU:  # interpolation may leave values a little below 0
-        raise InputError(
-            f"{path}: {lowest if lowest < -1 else highest:g} is no attenuation in 1/mm; if it holds CT numbers, give "
-            "the energy (--energy) to convert them"
-        )
+        outlier = lowest if lowest < -1 else highest
+        advice = "if it holds CT numbers, give the energy (--energy) to convert them"
+        raise InputError(f"{path}: {outlier:g} is no attenuation in 1/mm; {advice}")
     return volume
 
 

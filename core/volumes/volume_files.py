@@ -69,12 +69,7 @@ def read_volume(
 
 
 def read_volume_of(
-    path: AnyPath,
-    quantity: str,
-    advice: str = "",
-    *,
-    series: str | None = None,
-    progress: Progress | None = None,
+    path: AnyPath, quantity: str, advice: str = "", *, series: str | None = None, progress: Progress | None = None
 ) -> Volume:
     """Read a volume of a required `quantity`; a file that states another one raises `InputError`.
 

@@ -122,9 +122,7 @@ def _sources(system: Scanner) -> Floats:
     return system.poses()[:, :3, 3]
 
 
-def _shadows(
-    system: Scanner, m: int, hulls: Hulls, names: Sequence[str], depths: dict[int, float]
-) -> Iterator[ShadowedCone]:
+def _shadows(system: Scanner, m: int, hulls: Hulls, names: list[str], depths: dict[int, float]) -> Iterator[Finding]:
     """Yield the bodies that block the cone of source m; the hulls in `depths` overlap with its panel and are left out."""
     source, targets = _sources(system)[m], system[m].views((RAYS, RAYS)).rays(0)[1]
     rays = targets - source
@@ -153,9 +151,7 @@ def _overlap_depths(hulls: Hulls, m: int) -> dict[int, float]:
     return {p: depth for p, depth in zip(near.tolist(), depths.tolist(), strict=True) if depth > TOUCH}
 
 
-def _overlaps(
-    system: Scanner, m: int, hulls: Hulls, names: Sequence[str], depths: dict[int, float]
-) -> Iterator[Finding]:
+def _overlaps(system: Scanner, m: int, hulls: Hulls, names: list[str], depths: dict[int, float]) -> Iterator[Finding]:
     """Yield the bodies with which the panel of source m overlaps, and those that contain its focal spot."""
     number = int(system.numbers[m])
     overlapping = [p for p in depths if np.abs(hulls.vertices[p] - hulls.vertices[m]).max() > TOUCH]

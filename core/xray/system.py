@@ -53,16 +53,13 @@ XRAY_COLUMNS = ColumnTable(
         *_vector("u", "panel_u", "step from pixel to pixel along a row", "HIJ", "step row"),
         *_vector("v", "panel_v", "step from pixel to pixel along a column", "KLM", "step column"),
         _scalar("nv", "pixel_rows", "N", "rows of pixels", "rows", kind="whole", plausible=(1, 10_000), hints="rows"),
-        _scalar(
-            "nu", "pixel_columns", "O", "columns of pixels", "columns", kind="whole", plausible=(1, 10_000), hints="columns"
-        ),
+        _scalar("nu", "pixel_columns", "O", "columns of pixels", "columns", kind="whole", plausible=(1, 10_000),
+                hints="columns"),
         _scalar("kVp", "kvp", "P", "tube voltage, kV", "kV", kind="number", plausible=(10, 500), hints="kv voltage"),
         _scalar("mAs", "mas", "Q", "charge of an exposure, mAs", kind="number", plausible=(1e-6, 1e4), hints="mas"),
         _scalar("spot", "focal_spot", "R", "size of the focal spot", blank=0.0, plausible=(0, 10), hints="spot"),
-        _scalar(
-            "filter", "filters", "S", 'filters, mm, such as "Al 2.5 + Cu 0.1"', "filter material", kind="text", blank="",
-            hints="filter", pattern=(_FILTERS, "materials with their mm, such as Al 2.5 + Cu 0.1"),
-        ),
+        _scalar("filter", "filters", "S", 'filters, mm, such as "Al 2.5 + Cu 0.1"', "filter material", kind="text",
+                blank="", hints="filter", pattern=(_FILTERS, "materials with their mm, such as Al 2.5 + Cu 0.1")),
     )
 )  # fmt: skip
 """Columns of the sheet X-ray."""
@@ -223,9 +220,8 @@ class XraySystem(Scanner):
         """Return the solids of all sources: a cube behind the focal spot, for the tube, and the panel."""
         poses, parts = self.poses(), []
         poses[:, :3, [0, 2]] *= -1  # camera space is X = -u, Y = v, Z = -k
-        for number, pose, (x, y, depth, *sides) in zip(
-            self.numbers.tolist(), poses, self.fields().tolist(), strict=True
-        ):
+        numbers, fields = self.numbers.tolist(), self.fields().tolist()
+        for number, pose, (x, y, depth, *sides) in zip(numbers, poses, fields, strict=True):
             tube = _box((0.0, 0.0), (_TUBE, _TUBE), (0.0, _TUBE))
             panel = _box((x, y), (abs(sides[0]), abs(sides[1])), (-depth - PANEL_THICKNESS, -depth))
             parts.append(ModulePart(number, "source", f"Source {number:02d}", (tube, BOX_FACES), pose))

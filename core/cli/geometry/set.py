@@ -49,9 +49,7 @@ def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
     for name, columns in _settable_columns().items():
         column, is_vector = columns[0], columns[0].axis is not None
         letters = tuple(c.name.rpartition("_")[2].upper() for c in columns)
-        extra: dict[str, Any] = {"type": _TYPES.get(column.kind, float)} | (
-            {"nargs": len(columns)} if is_vector else {}
-        )
+        extra: Any = {"type": _TYPES.get(column.kind, float)} | ({"nargs": len(columns)} if is_vector else {})
         if column.kind == "choice":
             extra |= {"choices": column.choices, "type": lambda text, column=column: column.parse(text) or text}
         else:

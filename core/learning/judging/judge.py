@@ -152,9 +152,8 @@ class _JudgeRun:
         names = (f"{test.fingerprint}-{method.fingerprint[:16]}.jsonl" for method in methods)
         records = [Records(self.folder / "scores" / name) for name in names]
         rows_by_method: list[tuple[list[Row], list[Row]]] = [([], []) for _ in methods]
-        for kind, (events, draw, score) in enumerate(
-            ((test.events, 0, test.scores), (test.drawn, _SEVERAL, test.draws))
-        ):
+        scorings = (test.events, 0, test.scores), (test.drawn, _SEVERAL, test.draws)
+        for kind, (events, draw, score) in enumerate(scorings):
             for event in events:
                 cases = cache(partial(test.case, event, level))  # by the draw of noise, made once for all methods
                 key = event.recipe.fingerprint, event.number, level, draw

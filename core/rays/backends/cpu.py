@@ -207,10 +207,9 @@ def _run_places(
         raise InputError(f"expected {expected}; got {shape_text(shape)}")
     middle = float(planes[len(planes) // 2])
     relative = np.ascontiguousarray(planes - middle, dtype)
-    job = PlacesJob(
-        is_double=dtype == np.float64, points=points.ctypes.data, n=points.shape, planes=relative.ctypes.data,
-        middle=middle, values=arrays.ctypes.data, arrays=len(arrays), m=shape, matrices=matrices.ctypes.data, **settings,
-    )  # fmt: skip
+    job = PlacesJob(is_double=dtype == np.float64, points=points.ctypes.data, n=points.shape,
+                    planes=relative.ctypes.data, middle=middle, values=arrays.ctypes.data, arrays=len(arrays), m=shape,
+                    matrices=matrices.ctypes.data, **settings)  # fmt: skip
     kernel(level, job)
 
 
@@ -225,12 +224,10 @@ def _run(
             raise ValueError(f"expected a value for each of {len(rays)} rays, got {len(values)}")
     if mu is not None and mu_rays is None and mu.shape != volume.shape:
         raise ValueError(f"expected mu on the volume's lattice {volume.shape}, got {mu.shape}")
-    job = _Job(
-        is_double=volume.dtype == np.float64, attenuation=0 if mu is None else 1 if mu_rays is None else 2,
-        volume=as_voxel_array(volume, volume, kernel is library.backproject),
-        mu=VoxelArray() if mu is None else as_voxel_array(mu, volume),
-        **{name: array.ctypes.data for name, array in arrays.items() if array is not None},
-    )  # fmt: skip
+    job = _Job(is_double=volume.dtype == np.float64, attenuation=0 if mu is None else 1 if mu_rays is None else 2,
+               volume=as_voxel_array(volume, volume, kernel is library.backproject),
+               mu=VoxelArray() if mu is None else as_voxel_array(mu, volume),
+               **{name: array.ctypes.data for name, array in arrays.items() if array is not None})  # fmt: skip
     ray_arrays = [_fans(rays, mu_rays)] if isinstance(rays, IndexFans) else _columns(rays, mu_rays)
     addresses = [array.ctypes.data for array in ray_arrays]  # the arrays must live until the kernel is done
     if isinstance(rays, IndexFans):

@@ -100,9 +100,8 @@ class VolumeScore:
     @property
     def record(self) -> dict[str, Any]:
         """The scores as JSON can hold them, None for an unknown number."""
-        numbers = {
-            "_".join(filter(None, (row.name, row.unit))): getattr(self, row.name) for row in SCORES if not row.fits
-        }
+        rows = [row for row in SCORES if not row.fits]
+        numbers = {"_".join(filter(None, (row.name, row.unit))): getattr(self, row.name) for row in rows}
         parts = {key: value for _, score in self._scores(True) for key, value in score.record.items()}
         return {**{key: json_number(value) for key, value in numbers.items()}, **parts, "notes": list(self.notes)}
 

@@ -33,11 +33,7 @@ _ROUNDING = 1e-9  # fractions this close to 0 and 1 are 0 and 1
 
 
 def voxelize_mesh(
-    mesh: Any,
-    grid: Grid,
-    value: ArrayLike = 1.0,
-    quantity: str = "activity",
-    progress: Progress | None = None,
+    mesh: Any, grid: Grid, value: ArrayLike = 1.0, quantity: str = "activity", progress: Progress | None = None
 ) -> Volume:
     """Return a volume filled by one or several closed meshes; parts outside the grid are cut off.
 

@@ -86,7 +86,7 @@ def fault(draft: Draft, path: Path, placed: bool = True) -> str:
     if said and placed and draft.places and not any(place in message for place in draft.places for message in said):
         return f"{' or '.join(draft.places)} is not named: {'; '.join(said)}"
     columns = map_of(draft)
-    if outcome.system is not None or columns is None:
+    if columns is None:
         return ""
     mapped = read(path, columns)
     if draft.truth is None:

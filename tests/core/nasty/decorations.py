@@ -40,6 +40,25 @@ def add(decorate: Callable[..., None], *arguments: Any, **needs: Any) -> None:
     ELEMENTS.append(Element(decorate, arguments, tuple(needs.items())))
 
 
+USUAL = {"headings": "own", "style": "symbols"}
+IN_MM = {"order": TYPED, "unit": "", "units_of": "all"}
+TWO_SHEETS = {"second": "sheet", "once": "", "shuffled": False}
+CALCULATED = {**IN_MM, **TWO_SHEETS, "formulas": "stored"}
+NUMBERED = {"modules": 4, "labels": ("numbers", "numbers"), "number": "No."}
+AT_THE_CORNER = {
+    "modules": 4,
+    "top": 0,
+    "left": 0,
+    "gap": 0,
+    "under": 0,
+    "formulas": "",
+    "second": "",
+    "once": "",
+    "style": "symbols",
+}
+USERS_SHEETS = {"sheets": ("Coordinates", "Main")}
+"""What layouts must be like for several decorations."""
+
 SAME, NOBODY, BROKEN, UNMAPPED = "same", "nobody", "broken", "unmapped"
 """What a decoration makes of the numbers, if not a unit: nothing, something that nobody can tell, no numbers, or what a
 person reads and no column map."""
@@ -196,6 +215,8 @@ for _i, (_where, _needs) in enumerate(WHERE.items()):
     _near = re.search("^(band|over|under|between)", _where)
     _pairs = [(words, meaning) for meaning, texts in WORDS.items() for words in texts if _near or meaning != "near"]
     for _words, _meaning in _pairs[_i % 4 :: 4]:
+        if _where == "a column" and " in " in _words:
+            continue  # a sentence in each row is no unit of a column
         add(text, _where, _words, NOBODY if _meaning == "near" else _meaning, **_needs)
 
 
@@ -232,10 +253,10 @@ def number_format(draft: Draft, code: str | int, meaning: str, scope: str) -> No
     if meaning.startswith("plain"):
         draft.plain = plain
         return
-    if scope == "a cell" and meaning not in (SAME, BROKEN):
-        meaning = NOBODY
     says = {draft.layout.in_unit.get(name, "mm") for name in names}
-    if meaning == SAME and says != {"mm"}:
+    if says == {meaning}:
+        meaning = SAME
+    elif (scope == "a cell" and meaning not in (SAME, BROKEN)) or (meaning == SAME and says != {"mm"}):
         meaning = NOBODY
     mean(
         draft, meaning, names, *(f"{draft.table(name).sheet.name}!{draft.table(name).columns[name]}" for name in names)
@@ -364,28 +385,18 @@ for _name, _texts in OTHER_QUANTITIES.items():
 for _i, _form in enumerate(form for form in SPELLINGS if form != "without its unit"):
     _meaning = {"a stale formula": NOBODY, "a unit of two fonts": "cm", "stored twice": UNMAPPED}.get(_form, SAME)
     _style = "descriptions" if _i < 5 else "symbols"
-    add(
-        heading,
-        ("x1", "z1")[_i % 2] if _i > 2 else "l",
-        _form,
-        _meaning,
-        order=TYPED,
-        style=_style,
-        formulas="",
-        headings="others",
-    )
+    _column = ("x1", "z1")[_i % 2] if _i > 2 else "l"
+    add(heading, _column, _form, _meaning, order=TYPED, style=_style, formulas="", headings="others")
 add(heading, "x1", "see drawing 12", NOBODY, style="both", headings="others")
 add(
     heading,
     "x1",
     "without its unit",
     NOBODY,
-    style="symbols",
-    formulas="",
+    **{**USUAL, "headings": "others"},
     unit="cm",
     units_of="all",
     unit_form="{} ({})",
-    headings="others",
 )
 for _form in ("{} (cm)", "{}, in cm!"):
     add(heading, "x1", _form, "cm", style="both", unit="mm", unit_in="symbol", units_of="all", headings="others")
@@ -461,16 +472,7 @@ def second_place(draft: Draft, by_formula: bool) -> None:
 
 
 for _by_formula in (False, True):
-    add(
-        second_place,
-        _by_formula,
-        second="sheet",
-        once="",
-        shuffled=False,
-        sheets=("Coordinates", "Main"),
-        unit="",
-        headings="own",
-    )
+    add(second_place, _by_formula, **TWO_SHEETS, **USERS_SHEETS, unit="", headings="own")
 
 
 # Rows
@@ -577,8 +579,18 @@ for _mark, _fill, _meaning in (
     *(("removed:", None, NOBODY), ("mean", "AVERAGE({0}:{1})", NOBODY)),
 ):
     for _labels in (("numbers", "numbers"), ("", "")):
-        add(between, _mark, _fill, _meaning, headings="own", style="symbols", modules=4, formulas="", second=("", "sheet")[_labels[0] == ""], once="",
-            labels=_labels, shuffled=False)  # fmt: skip
+        _second = ("", "sheet")[_labels[0] == ""]
+        add(
+            between,
+            _mark,
+            _fill,
+            _meaning,
+            **USUAL,
+            **{**TWO_SHEETS, "second": _second},
+            modules=4,
+            formulas="",
+            labels=_labels,
+        )
 
 
 def filled_down(draft: Draft) -> None:
@@ -610,17 +622,7 @@ def extra_dimensions(draft: Draft, kind: str) -> None:
 
 for _kind in ("numbered", "unnumbered", "fewer"):
     add(extra_dimensions, _kind, second="sheet", once="", formulas="", modules=4, numbers="rows")
-add(
-    extra_dimensions,
-    "fewer",
-    numbers="rows",
-    second="sheet",
-    once="",
-    formulas="",
-    modules=4,
-    labels=("", ""),
-    shuffled=False,
-)
+add(extra_dimensions, "fewer", **TWO_SHEETS, numbers="rows", formulas="", modules=4, labels=("", ""))
 
 
 # Labels
@@ -662,6 +664,8 @@ def _labelled(table: Table, column: str, head: str, values: list[Any]) -> None:
         table.sheet[f"{column}{row}"] = value
 
 
+for _kind in ("twice", "missing", "spare", "stale"):
+    add(labels, _kind, **NUMBERED, second="", once="")
 for _kind in (
     "twice",
     "missing",
@@ -673,8 +677,7 @@ for _kind in (
     "serials",
     "serials at odds",
 ):
-    for _second in ("", "sheet") if _kind in ("twice", "missing", "spare", "stale") else ("sheet",):
-        add(labels, _kind, second=_second, modules=4, once="", labels=("numbers", "numbers"), number="No.")
+    add(labels, _kind, **NUMBERED, second="sheet", once="")
 add(labels, "serials at odds", second="sheet", modules=4, once="", labels=("", ""))
 
 
@@ -846,16 +849,7 @@ def column_of_formulas(draft: Draft, kind: str, values: str) -> None:
 
 for _kind in ("plain", "shared", "array", "one array", "what-if"):
     for _values in ("stored", "none", "zeros", "one stale")[: 2 if _kind in ("one array", "what-if") else 4]:
-        add(
-            column_of_formulas,
-            _kind,
-            _values,
-            modules=4,
-            order=TYPED,
-            formulas="",
-            numbers="formulas",
-            labels=("numbers", "numbers"),
-        )
+        add(column_of_formulas, _kind, _values, **NUMBERED, order=TYPED, formulas="", numbers="formulas")
 
 
 def settings(draft: Draft, calculation: str) -> None:
@@ -878,18 +872,7 @@ def changed_since(draft: Draft, name: str) -> None:
 
 
 for _name in ("x1", "d", "Td"):
-    add(
-        changed_since,
-        _name,
-        numbers="since",
-        order=TYPED,
-        second="sheet",
-        once="",
-        formulas="stored",
-        unit="",
-        units_of="all",
-        shuffled=False,
-    )
+    add(changed_since, _name, **CALCULATED, numbers="since")
 
 
 def wrongly_stored(draft: Draft, name: str, value: Any, every: bool) -> None:
@@ -903,18 +886,7 @@ def wrongly_stored(draft: Draft, name: str, value: Any, every: bool) -> None:
 
 for _i, _name in enumerate(("l", "b", "elevation", "H", "x2", "slope")):
     for _j, _value in enumerate((0, 1.0, None, Error("#NAME?"))):
-        add(
-            wrongly_stored,
-            _name,
-            _value,
-            (_i + _j) % 2 == 0,
-            numbers="stored",
-            order=TYPED,
-            second="sheet",
-            formulas="stored",
-            unit="",
-            units_of="all",
-        )
+        add(wrongly_stored, _name, _value, (_i + _j) % 2 == 0, **CALCULATED, numbers="stored")
 
 
 def length(draft: Draft, kind: str) -> None:
@@ -938,17 +910,7 @@ def length(draft: Draft, kind: str) -> None:
 
 
 for _kind in ("one typed", "every typed", "every own", "one missing"):
-    add(
-        length,
-        _kind,
-        numbers="l",
-        order=TYPED,
-        second="sheet",
-        formulas="stored",
-        unit="",
-        units_of="all",
-        shuffled=False,
-    )
+    add(length, _kind, **CALCULATED, numbers="l")
 
 
 def derived(draft: Draft, name: str, change: str, head: str, meaning: str) -> None:
@@ -976,9 +938,9 @@ def derived(draft: Draft, name: str, change: str, head: str, meaning: str) -> No
 
 
 for _name in ("b", "H", "x2", "range"):
-    add(derived, _name, "/10", "{} (cm)", "plain", formulas="typed", unit="", units_of="all", order=TYPED)
-    add(derived, _name, "/10", "{}", NOBODY, formulas="typed", unit="", units_of="all", order=TYPED)
-    add(derived, _name, "rounded", "{}", "plain", formulas="typed", unit="", units_of="all", order=TYPED)
+    add(derived, _name, "/10", "{} (cm)", "plain", **IN_MM, formulas="typed")
+    add(derived, _name, "/10", "{}", NOBODY, **IN_MM, formulas="typed")
+    add(derived, _name, "rounded", "{}", "plain", **IN_MM, formulas="typed")
 for _name, _change, _head, _meaning in (
     ("b", "/100", "{} (dm)", SAME),
     ("azimuth", "degrees", "pinhole azimuth (degrees)", "plain"),
@@ -991,18 +953,7 @@ for _name, _change, _head, _meaning in (
     ("azimuth", "rounded", "pinhole azimuth", "plain"),
     ("H", "-10", "{}", NOBODY),
 ):
-    add(
-        derived,
-        _name,
-        _change,
-        _head,
-        _meaning,
-        formulas="typed",
-        unit="",
-        units_of="all",
-        style="symbols",
-        order=TYPED,
-    )
+    add(derived, _name, _change, _head, _meaning, **IN_MM, formulas="typed", style="symbols")
 
 
 def coordinates_since(draft: Draft, kind: str) -> None:
@@ -1025,7 +976,7 @@ def coordinates_since(draft: Draft, kind: str) -> None:
 
 
 for _kind in ("exchanged", "mirrored", "sorted alone"):
-    add(coordinates_since, _kind, numbers="since", order=TYPED, formulas="typed", unit="", units_of="all", modules=4)
+    add(coordinates_since, _kind, **IN_MM, numbers="since", formulas="typed", modules=4)
 
 
 def scale(draft: Draft, factor: float, names: tuple[str, ...], one: bool) -> None:
@@ -1039,11 +990,8 @@ def scale(draft: Draft, factor: float, names: tuple[str, ...], one: bool) -> Non
     draft.truth = truth if truth is not None and not names else None
 
 
-add(scale, 0.1, ("d",), False, unit="", formulas="", order=TYPED, numbers="scaled")
-add(scale, 10.0, ("Ld",), False, unit="", formulas="", order=TYPED, numbers="scaled")
-add(scale, 0.1, POSITION, True, unit="", formulas="", order=TYPED, numbers="scaled")
-add(scale, 1e-3, TYPED, False, unit="", formulas="", order=TYPED, numbers="scaled")
-add(scale, 10.0, TYPED, False, unit="", formulas="", order=TYPED, numbers="scaled")
+for _factor, _names, _one in ((0.1, ("d",), 0), (10, ("Ld",), 0), (0.1, POSITION, 1), (1e-3, TYPED, 0), (10, TYPED, 0)):
+    add(scale, _factor, _names, bool(_one), unit="", formulas="", order=TYPED, numbers="scaled")
 
 
 # Sheets
@@ -1102,16 +1050,7 @@ for _name, _kind in (
     *(("Legend", "legend down"), ("Legend", "legend across"), ("Plot", "plot")),
 ):
     for _state in ("visible", "hidden", "veryHidden") if "other" in _kind else ("visible",):
-        add(
-            further_sheet,
-            _name,
-            _kind,
-            _state,
-            second="sheet",
-            sheets=("Coordinates", "Main"),
-            formulas="",
-            headings="own",
-        )
+        add(further_sheet, _name, _kind, _state, **USERS_SHEETS, second="sheet", formulas="", headings="own")
 add(further_sheet, "backup", "other numbers", "visible", headings="own")
 
 
@@ -1171,17 +1110,7 @@ def hidden_parts(draft: Draft, kind: str) -> None:
 
 
 for _kind in ("rows", "columns", "a filter", "a table", "a short table", "a table with totals"):
-    add(
-        hidden_parts,
-        _kind,
-        formulas="",
-        modules=4,
-        second="",
-        gap=0,
-        labels=("numbers", "numbers"),
-        number="No.",
-        left=0,
-    )
+    add(hidden_parts, _kind, **NUMBERED, formulas="", second="", gap=0, left=0)
 
 
 # The file
@@ -1219,22 +1148,10 @@ def stored_oddly(draft: Draft, kind: str) -> None:
     sheet = draft.tables[0].sheet
     sheet.row_order, meaning = STORED_ODDLY[kind]
     mean(draft, meaning, (), sheet.name, "scanner.xlsx")
+    draft.mappable = not (draft.layout.columns and "without names" in kind)  # cells without names are elsewhere
     if kind == "rows and cells without names" or "numbered" in kind or "letters" in kind or "$" in kind:
         draft.truth = None if draft.layout.top or draft.layout.left or draft.layout.gap else draft.truth
 
 
 for _kind in STORED_ODDLY:
-    add(
-        stored_oddly,
-        _kind,
-        numbers="XML",
-        modules=4,
-        top=0,
-        left=0,
-        gap=0,
-        under=0,
-        formulas="",
-        second="",
-        once="",
-        style="symbols",
-    )
+    add(stored_oddly, _kind, **AT_THE_CORNER, numbers="XML")

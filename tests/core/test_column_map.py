@@ -15,11 +15,10 @@ import pytest
 import mphdrr.core as mph
 from mphdrr.core.cli import main
 from mphdrr.core.errors import InputError
-from mphdrr.core.geometry.columns import LENGTH_UNITS
 
 from .nasty.case import read
-from .test_workbook import CENTERS, assert_plain, plain, saved
 from .test_workbook import _typed as typed
+from .test_workbook import assert_plain, plain, saved
 from .workbooks import DIMENSIONS, by_design
 
 pytestmark = pytest.mark.filterwarnings("error")
@@ -86,56 +85,6 @@ def test_nothing_but_what_the_map_names_is_read(tmp_path):
         coordinates["B10"] = 1.0
 
     assert_plain(mph.read_system(silent(tmp_path, edit), columns=mph.ColumnMap.from_toml(MAP)))
-
-
-@pytest.mark.parametrize("unit", LENGTH_UNITS)
-def test_units_of_the_map_are_converted(unit, tmp_path):
-    def edit(main, coordinates):
-        for row in range(3, 7):
-            for column in (2, 3, 4, 7):
-                coordinates.cell(row, column).value /= LENGTH_UNITS[unit]
-
-    columns = MAP.split("[[tables]]")[1].replace('"mm"', f'"{unit}"')
-    text = "[[tables]]".join(["", columns, MAP.split("[[tables]]")[2]])
-    system = mph.read_system(silent(tmp_path, edit), columns=mph.ColumnMap.from_toml(text))
-    np.testing.assert_allclose(system.centers, CENTERS, rtol=1e-14)
-
-
-def test_rows_go_by_number_by_name_in_order_or_one_for_all(tmp_path):
-    def shuffled(main, coordinates):
-        for row, number in enumerate((3, 1, 4, 2), start=3):
-            main.cell(row, 1).value, main.cell(row, 2).value = number, 2.0 + number / 10
-
-    by_number = mph.read_system(
-        silent(tmp_path, shuffled), columns=mph.ColumnMap.from_toml(MAP.replace("l =", "# l ="))
-    )
-    np.testing.assert_allclose(by_number.pinhole_diameter, [2.1, 2.2, 2.3, 2.4])
-    in_order = MAP.replace('rows = "by number"\nnumber = "A"', 'rows = "in order"').replace("l =", "# l =")
-    system = mph.read_system(tmp_path / "scanner.xlsx", columns=mph.ColumnMap.from_toml(in_order))
-    np.testing.assert_allclose(system.pinhole_diameter, [2.3, 2.1, 2.4, 2.2])
-    one = in_order.replace('"in order"', '"one for all"').replace(
-        "first_row = 3\nlast_row = 6\nrows", "first_row = 5\nrows"
-    )
-    system = mph.read_system(tmp_path / "scanner.xlsx", columns=mph.ColumnMap.from_toml(one))
-    np.testing.assert_allclose(system.pinhole_diameter, [2.4] * 4)
-
-    def named(main, coordinates):
-        for row, name in enumerate(("M01", "M02", "M03", "M04"), start=3):
-            coordinates.cell(row, 1).value = name
-            main.cell(9 - row, 1).value, main.cell(9 - row, 2).value = name, 2.0 + row / 10
-
-    system = mph.read_system(silent(tmp_path, named), columns=mph.ColumnMap.from_toml(MAP.replace("l =", "# l =")))
-    np.testing.assert_allclose(system.pinhole_diameter, [2.3, 2.4, 2.5, 2.6])
-    np.testing.assert_array_equal(system.numbers, [1, 2, 3, 4])
-
-
-def test_rows_are_skipped(tmp_path):
-    def edit(main, coordinates):
-        coordinates.insert_rows(5, 2)
-        coordinates["B5"] = "upper rings"
-
-    text = MAP.replace("last_row = 6\nnumber", "last_row = 8\nskip_rows = [5, 6]\nnumber")
-    assert_plain(mph.read_system(silent(tmp_path, edit), columns=mph.ColumnMap.from_toml(text)))
 
 
 def _without(*lines: str) -> str:

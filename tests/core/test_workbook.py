@@ -138,15 +138,6 @@ def test_real_workbook_has_its_80_modules(workbook):
         np.testing.assert_array_equal(values, expected)
 
 
-def test_stored_values_make_no_difference(workbook, tmp_path):
-    """openpyxl drops the stored values of formulas when it saves."""
-    stripped = openpyxl.load_workbook(workbook)
-    stripped.save(tmp_path / "stripped.xlsx")
-    with_values, without = read_system(workbook), read_system(tmp_path / "stripped.xlsx")
-    np.testing.assert_array_equal(without.centers, with_values.centers)
-    np.testing.assert_allclose(without.collimator_length, with_values.collimator_length, rtol=0, atol=1e-10)
-
-
 def test_source_names_file_and_cells(workbook):
     source = read_system(workbook).source
     assert source.path == workbook.absolute()
@@ -312,39 +303,6 @@ def test_sums_below_a_table_without_numbers_are_no_module(tmp_path):
     assert_plain(read_edited(tmp_path, edit))
 
 
-@pytest.mark.parametrize("n", [1, 2, 40])
-def test_any_number_of_modules(n, tmp_path, rng):
-    directions = rng.normal(size=(n, 3))
-    centers = np.round(directions / np.linalg.norm(directions, axis=1)[:, None] * rng.uniform(150, 300, (n, 1)), 6)
-    system = read_system(saved(plain(centers), tmp_path))
-    np.testing.assert_array_equal(system.centers, centers)
-    np.testing.assert_allclose(system.collimator_length, collimator_length(system.pinhole_distance, 2.3, 50, 75))
-
-
-def test_dimensions_go_by_module_number(tmp_path):
-    def edit(main, coordinates):
-        _typed(main, coordinates)
-        for row, (number, side) in enumerate([(7, 57.0), (5, 55.0), (8, 58.0), (6, 56.0)], start=3):
-            main.cell(row, 1, number), main.cell(row, 4, side), main.cell(row, 5, side / 5)
-            coordinates.cell(row, 1, row + 2)
-        coordinates.delete_cols(5, 10)
-
-    system = read_edited(tmp_path, edit)
-    np.testing.assert_array_equal(system.numbers, [5, 6, 7, 8])
-    np.testing.assert_array_equal(system.detector_side, [55, 56, 57, 58])
-    assert system.source.cell("Ld", 5) == ("Main", "D4")
-
-
-def test_dimensions_go_by_row_order_without_numbers(tmp_path):
-    def edit(main, coordinates):
-        coordinates.delete_cols(5, 10)
-        main.delete_cols(1)
-        for row, side in enumerate([51.0, 52.0, 53.0, 54.0], start=3):
-            main.cell(row, 3, side)
-
-    np.testing.assert_array_equal(read_edited(tmp_path, edit).detector_side, [51, 52, 53, 54])
-
-
 def test_dimensions_may_stand_in_two_sheets(tmp_path):
     def edit(main, coordinates):
         _typed(main, coordinates)
@@ -401,32 +359,6 @@ def test_difference_from_the_formulas_is_warned_of(cell, quantity, tmp_path):
     numbers = rf"has {quantity} = (\S+) \w+, the formula gives (\S+) \w+ \(the formula's is used\)"
     given, expected = re.fullmatch(rf"scanner\.xlsx: Coordinates!{cell} {numbers}", message).groups()
     assert float(given) - float(expected) == pytest.approx(0.25, abs=1e-5)
-
-
-def test_elevation_may_be_in_degrees(tmp_path):
-    def edit(main, coordinates):
-        coordinates["N2"] = "pinhole elevation (degrees)"
-        for row in range(3, 7):
-            coordinates.cell(row, 14, f"=DEGREES(ATAN2(L{row},D{row}))")
-
-    assert_plain(read_edited(tmp_path, edit))
-
-
-def test_angles_a_turn_apart_agree(tmp_path):
-    assert_plain(read_edited(tmp_path, _set("Coordinates", "M3", "=ATAN2(B3,C3)+2*PI()")))
-
-
-def test_values_typed_as_displayed_are_not_warned_of(tmp_path):
-    def edit(main, coordinates):
-        _typed(main, coordinates)
-        for row in range(3, 7):
-            for column in range(5, 12):
-                coordinates.cell(row, column, round(coordinates.cell(row, column).value, 2))
-            for column in range(12, 15):
-                coordinates.cell(row, column, round(coordinates.cell(row, column).value, 3))
-
-    system = read_edited(tmp_path, edit)
-    assert system.collimator_length[0] == round(float(system.collimator_length[0]), 2)  # typed numbers prevail
 
 
 def test_tolerance_is_the_rounding_shown():

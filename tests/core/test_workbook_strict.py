@@ -191,12 +191,6 @@ def right_values(folder: Path, book: Workbook | None = None) -> dict[tuple[str, 
     return {("Coordinates", f"{own}{row}"): cells[f"{new}{row}"].value for own, new in columns for row in rows}
 
 
-@pytest.mark.parametrize("settings", ["", 'fullCalcOnLoad="1"', 'calcCompleted="0"', 'calcMode="manual"'])
-def test_stored_values_that_are_right_are_read(settings, tmp_path):
-    right = right_values(tmp_path)
-    assert_plain(mph.read_system(with_values(tmp_path, lambda *at: right[at], settings)))
-
-
 @pytest.mark.parametrize("settings", ["", 'fullCalcOnLoad="1"'])
 def test_zeros_stored_for_all_formulas_count_as_not_stored(settings, tmp_path):
     assert_plain(mph.read_system(with_values(tmp_path, lambda *at: 0, settings)))
@@ -315,15 +309,6 @@ def test_a_number_of_a_formula_beyond_us_is_used_and_warned_of_where_the_file_as
 
 
 # The file
-
-
-def test_another_sheet_that_speaks_of_another_unit_is_warned_of(tmp_path):
-    def edit(main, coordinates):
-        typed(main, coordinates)
-        main.parent.create_sheet("Read me")["B2"] = "All lengths in cm"
-
-    with pytest.warns(InputWarning, match="Read me!B2 says 'All lengths in cm', where the headings of the scanner's"):
-        assert_plain(read_edited(tmp_path, edit))
 
 
 def test_a_gap_between_modules_without_numbers_is_warned_of(tmp_path):

@@ -536,24 +536,26 @@ def _copied_table(main: Worksheet, coordinates: Worksheet) -> None:
     main.parent.copy_worksheet(coordinates).title = "B"
 
 
+def _bad(cell: str, value: object, message: str) -> tuple[Callable[[Worksheet, Worksheet], None], str]:
+    """Return the edit of a cell, and the refusal that begins with it."""
+    return _set(*cell.split("!"), value), f"{cell} {message}".rstrip()
+
+
 BAD_CELLS = {
-    "text": (_set("Coordinates", "B4", "abc"), "Coordinates!B4 holds the text 'abc', expected x1 of module 2"),
-    "text of several lines": (_set("Coordinates", "B4", "a\nb"), "Coordinates!B4 holds the text 'a b'"),
-    "number as text": (_set("Coordinates", "D4", "12,5"), "Coordinates!D4 holds the text '12,5', expected z1"),
-    "blank": (_set("Coordinates", "C5", None), "Coordinates!C5 is blank, expected y1 of module 3"),
-    "blank dimension": (_set("Main", "D4", None), "Main!D4 is blank, expected Ld of module 2"),
-    "boolean": (_set("Main", "B3", True), "Main!B3 is TRUE, expected d"),
-    "date": (
-        _set("Coordinates", "B3", datetime.date(2021, 3, 4)),
-        "Coordinates!B3 is formatted as a date or time (yyyy-mm-dd)",
-    ),
-    "error": (_set("Coordinates", "B3", "#REF!"), "Coordinates!B3 shows the error #REF!, expected x1"),
-    "error in l": (_set("Coordinates", "G4", "#REF!"), "Coordinates!G4 shows the error #REF!, expected l"),
-    "error in a check": (_set("Coordinates", "E4", "#NAME?"), "Coordinates!E4 shows the error #NAME?, expected b"),
-    "reference to an error": (_set("Coordinates", "B3", "=#REF!+1"), "Coordinates!B3 shows the error #REF!"),
-    "division by zero": (_set("Coordinates", "B3", "=1/Z1"), "Coordinates!B3 shows the error #DIV/0!"),
-    "not finite": (_set("Coordinates", "B3", 1e999), "Coordinates!B3"),
-    "cycle": (_set("Coordinates", "B3", "=B3+1"), "Coordinates!B3 holds the formula =B3+1 without a stored value"),
+    "text": _bad("Coordinates!B4", "abc", "holds the text 'abc', expected x1 of module 2"),
+    "text of several lines": _bad("Coordinates!B4", "a\nb", "holds the text 'a b'"),
+    "number as text": _bad("Coordinates!D4", "12,5", "holds the text '12,5', expected z1"),
+    "blank": _bad("Coordinates!C5", None, "is blank, expected y1 of module 3"),
+    "blank dimension": _bad("Main!D4", None, "is blank, expected Ld of module 2"),
+    "boolean": _bad("Main!B3", True, "is TRUE, expected d"),
+    "date": _bad("Coordinates!B3", datetime.date(2021, 3, 4), "is formatted as a date or time (yyyy-mm-dd)"),
+    "error": _bad("Coordinates!B3", "#REF!", "shows the error #REF!, expected x1"),
+    "error in l": _bad("Coordinates!G4", "#REF!", "shows the error #REF!, expected l"),
+    "error in a check": _bad("Coordinates!E4", "#NAME?", "shows the error #NAME?, expected b"),
+    "reference to an error": _bad("Coordinates!B3", "=#REF!+1", "shows the error #REF!"),
+    "division by zero": _bad("Coordinates!B3", "=1/Z1", "shows the error #DIV/0!"),
+    "not finite": _bad("Coordinates!B3", 1e999, ""),
+    "cycle": _bad("Coordinates!B3", "=B3+1", "holds the formula =B3+1 without a stored value"),
     "long cycle": (
         lambda main, c: (
             _set("Coordinates", "B3", "=Main!H9")(main, c),
@@ -561,21 +563,15 @@ BAD_CELLS = {
         ),
         "Coordinates!B3 holds the formula =Main!H9 without a stored value",
     ),
-    "formula beyond arithmetic": (
-        _set("Main", "B3", "=VLOOKUP(1,A:B,2)"),
-        "Main!B3 holds the formula =VLOOKUP(1,A:B,2)",
-    ),
-    "formula of another file": (_set("Main", "B3", "=[1]Main!B3"), "Main!B3 holds the formula =[1]Main!B3"),
+    "formula beyond arithmetic": _bad("Main!B3", "=VLOOKUP(1,A:B,2)", "holds the formula =VLOOKUP(1,A:B,2)"),
+    "formula of another file": _bad("Main!B3", "=[1]Main!B3", "holds the formula =[1]Main!B3"),
     "no such sheet in a formula": (_set("Main", "B3", "=Old!B3"), "there is no sheet Old"),
-    "zero diameter": (_set("Main", "B3", 0), "Main!B3 has d = 0 mm, expected more than 0"),
-    "negative side": (_set("Main", "D5", -50), "Main!D5 has Ld = -50 mm, expected more than 0"),
-    "zero thickness": (_set("Main", "E3", 0), "Main!E3 has Td = 0 mm"),
-    "negative radius": (_set("Main", "C3", -75), "Main!C3 has R = -75 mm"),
-    "negative length": (_set("Coordinates", "G3", -1), "Coordinates!G3 has l = -1 mm, expected more than 0"),
-    "hole wider than crystal": (
-        _set("Main", "B3", 51),
-        "Main!B3 has d = 51 mm, expected less than Ld = 50 mm in Main!D3",
-    ),
+    "zero diameter": _bad("Main!B3", 0, "has d = 0 mm, expected more than 0"),
+    "negative side": _bad("Main!D5", -50, "has Ld = -50 mm, expected more than 0"),
+    "zero thickness": _bad("Main!E3", 0, "has Td = 0 mm"),
+    "negative radius": _bad("Main!C3", -75, "has R = -75 mm"),
+    "negative length": _bad("Coordinates!G3", -1, "has l = -1 mm, expected more than 0"),
+    "hole wider than crystal": _bad("Main!B3", 51, "has d = 51 mm, expected less than Ld = 50 mm in Main!D3"),
     "at the isocentre": (_center(5, 0, 0, 0), "Coordinates!B5 and y1, z1 put the pinhole of module 3 at the isocentre"),
     "inside the ROI": (
         _center(5, 30, 40, 0),
@@ -583,22 +579,16 @@ BAD_CELLS = {
     ),
     "on the ROI": (_center(5, 75, 0, 0), "Coordinates!B5 and y1, z1 put the pinhole of module 3 75 mm from"),
     "beyond all numbers": (_center(5, 1e200, 0, 0), "Coordinates!B5 and y1, z1 put the pinhole of module 3 too far"),
-    "same number": (_set("Coordinates", "A5", 2), "Coordinates!A5 is module 2, as is Coordinates!A4"),
-    "same number in Main": (_set("Main", "A5", 2), "Main!A5 is module 2, as is Main!A4"),
+    "same number": _bad("Coordinates!A5", 2, "is module 2, as is Coordinates!A4"),
+    "same number in Main": _bad("Main!A5", 2, "is module 2, as is Main!A4"),
     "same place": (
         _center(6, *CENTERS[1]),
         "Coordinates!B6 and y1, z1 put the pinhole of module 4 at the place of module 2",
     ),
-    "number missing": (_set("Coordinates", "A5", None), "Coordinates!A5 is blank, expected a module's number"),
-    "number is text": (
-        _set("Coordinates", "A5", "left"),
-        "Coordinates!A5 holds the text 'left', expected a module's number",
-    ),
-    "number is a fraction": (_set("Coordinates", "A5", 2.5), "Coordinates!A5 is 2.5, expected a module's number"),
-    "number without module": (
-        _set("Coordinates", "A7", 5),
-        "Coordinates!A7 is module 5, expected a row for it in sheet Main too",
-    ),
+    "number missing": _bad("Coordinates!A5", None, "is blank, expected a module's number"),
+    "number is text": _bad("Coordinates!A5", "left", "holds the text 'left', expected a module's number"),
+    "number is a fraction": _bad("Coordinates!A5", 2.5, "is 2.5, expected a module's number"),
+    "number without module": _bad("Coordinates!A7", 5, "is module 5, expected a row for it in sheet Main too"),
     "sum below the table": (
         lambda _, table: table.append(["mean", 1.0, 2.0, 3.0]),
         "Coordinates!A7 holds the text 'mean', expected a module's number",
@@ -614,11 +604,8 @@ BAD_CELLS = {
     ),
     "headings at odds": (_set("Coordinates", "B1", "y2"), "Coordinates!B2 is headed as x1 but Coordinates!B1 as y2"),
     "two tables": (_copied_table, "A!B1 and B!B1, of two sheets, are both headed as x1"),
-    "unit in the other sheet": (_set("Main", "H1", "all in cm"), "Main!H1 holds 'all in cm'"),
-    "module without coordinates": (
-        _without_coordinates,
-        "Coordinates!A4 is blank, expected a module's number",
-    ),
+    "unit in the other sheet": _bad("Main!H1", "all in cm", "holds 'all in cm'"),
+    "module without coordinates": (_without_coordinates, "Coordinates!A4 is blank, expected a module's number"),
     "text below modules without numbers": (
         lambda main, table: (_unnumbered(main, table), _set("Coordinates", "A7", "n/a")(main, table)),
         "expected one or one for each of the 5 modules of sheet Coordinates",

@@ -372,35 +372,9 @@ GEOMETRY = Layout(sheets=("Geometry", ""))
 """One sheet: A number, B x1, C y1, D z1, E d, F R, G Ld, H Td, I l; headings in row 1."""
 
 
-def users(system: PinholeSystem = SCANNER) -> Book:
-    """Return the users' workbook of a scanner."""
-    return laid_out(USERS, system).book
-
-
-def one_sheet(system: PinholeSystem = BIG, **changes: Any) -> Book:
-    """Return the workbook of one sheet of a scanner."""
-    return laid_out(Layout(**{"sheets": ("Geometry", ""), **changes}), system).book
-
-
 def formulas_of(sheet: Sheet) -> dict[str, Formula]:
     """Return the formulas of a sheet by their cells."""
     return {at: value for at, value in sheet.cells.items() if isinstance(value, Formula)}
-
-
-def typed(book: Book) -> Book:
-    """Return the book with the values of its formulas typed in."""
-    for sheet in book.sheets:
-        for at, formula in formulas_of(sheet).items():
-            sheet[at] = formula.stored
-    return book
-
-
-def with_cells(book: Book, **cells: Any) -> Book:
-    """Return the book with cells such as B3=1.0 in its first sheet or Main_P4=2.0 in sheet Main."""
-    for name, value in cells.items():
-        sheet, _, at = name.rpartition("_")
-        (book[sheet] if sheet else book.sheets[0])[at] = value
-    return book
 
 
 # Column maps

@@ -1,4 +1,4 @@
-"""Adds the library of the C kernels to the package that pyproject.toml describes, and what type checkers read."""
+"""Add the library of the C kernels, and stubs for type checkers, to the package that pyproject.toml describes."""
 
 import ast
 import os
@@ -18,7 +18,7 @@ PUBLIC = ("core", "core/events", "core/projector", "core/workbook")
 
 
 def stub_of(source):
-    """Give what says the names of a package's public interface to type checkers: imports count if they name them twice."""
+    """Return the stub of a package's public interface: for type checkers an import counts if it names each name twice."""
     body = ast.parse(source).body
     body = next((node.body for node in body if isinstance(node, ast.If)), body)  # imports for type checkers alone
     imports = [node for node in body if isinstance(node, ast.ImportFrom) and node.module != "lazy"]
@@ -31,16 +31,16 @@ def stub_of(source):
 
 
 class WithKernels(build_py):
-    """Builds the library into the package; into the tree itself for `pip install -e`."""
+    """Build step that adds the library to the package; to the tree itself for `pip install -e`."""
 
     def find_package_modules(self, package, package_dir):
-        """Leave out this file, which lies beside the package's own."""
+        """Return the package's own modules, without this file, which lies beside them."""
         return [
             found for found in super().find_package_modules(package, package_dir) if found[:2] != ("mphdrr", "setup")
         ]
 
     def run(self):
-        """Do so, or say that there is none for this machine."""
+        """Build the library and the stubs, or warn that there is no library for this machine."""
         super().run()
         if not self.editable_mode:
             for package in PUBLIC:
@@ -63,7 +63,7 @@ class PlatformWheel(bdist_wheel):
         super().finalize_options()
 
     def get_tag(self):
-        """Give the parts of the wheel's name that say where it fits."""
+        """Return the parts of the wheel's name that say where it fits."""
         return ("py3", "none", build_kernels.PLATFORMS[self.kernels].tag) if self.kernels else super().get_tag()
 
 

@@ -59,8 +59,11 @@ def advice(items: list[bpy.types.Object]) -> str:
 def after_load(*_: Any) -> None:
     """Print which files are missing, and what the user can do."""
     for scene in bpy.data.scenes:
-        to_remake, others = missing_volumes(scene)
-        for items, action in ((to_remake, "press Make Again"), (others, "Find Missing Volume Files, or import again,")):
+        to_remake, to_find = missing_volumes(scene)
+        for items, action in (
+            (to_remake, "press Make Again"),
+            (to_find, "Find Missing Volume Files, or import again,"),
+        ):
             if items:
                 names = ", ".join(item.name for item in items)
                 print(f"mphDRR: the voxel files of {names} are missing: {action} in the Phantom panel")

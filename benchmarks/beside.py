@@ -39,7 +39,7 @@ SLOWER = 1.05
 
 @dataclass(frozen=True)
 class Beside:
-    """A work that both do, in seconds; `note` where they do not do quite the same."""
+    """The times of one task by mphDRR and by a peer, s; `note` says where the two tasks differ."""
 
     chapter: str
     work: str
@@ -50,24 +50,24 @@ class Beside:
 
     @property
     def ratio(self) -> float:
-        """Our time by theirs."""
+        """The time of mphDRR divided by the peer's."""
         return self.ours / self.theirs
 
 
 def in_one_run() -> bool:
-    """Whether this is a part of a run of all, whose own parts before it are the machine's load."""
+    """Return whether this script runs as a part of `make bench-all`, whose earlier parts are the machine's load."""
     return _FILE in os.environ
 
 
 def tell(chapter: str, work: str, ours: float, peer: str, theirs: float, note: str = "") -> None:
-    """Keep a comparison for the table; nothing where no table is made."""
+    """Keep a comparison for the table of `make bench-all`; do nothing where no table is made."""
     if in_one_run():
         with open(os.environ[_FILE], "a", encoding="utf-8") as file:
             print(json.dumps(asdict(Beside(chapter, work, ours, peer, theirs, note))), file=file)
 
 
 def section(found: list[Beside], missing: list[str], load: float, minutes: float, picture: str | None) -> str:
-    """The section of the page."""
+    """Return the page's section on peers: table, notes and picture."""
     head = ("chapter", "work", "mphDRR s", "peer", "peer s", "times as fast", "")
     lines = [f"| {' | '.join(head)} |", f"| {' | '.join(['---'] * len(head))} |"]
     for one in found:
@@ -95,14 +95,14 @@ def section(found: list[Beside], missing: list[str], load: float, minutes: float
 
 
 def write(text: str, page: Path) -> None:
-    """Put the section behind the page's head, in place of the one that was there."""
+    """Insert the section after the page's head, in place of the previous one."""
     lines = page.read_text(encoding="utf-8").split("\n## ")
     others = [part for part in lines[1:] if not part.startswith(HEADING.removeprefix("## "))]
     page.write_text("\n## ".join([lines[0], text.removeprefix("## "), *others]), encoding="utf-8")
 
 
 def draw(found: list[Beside], path: Path) -> bool:
-    """The picture; False without matplotlib."""
+    """Draw the ratios of all comparisons to `path`; return False where matplotlib is missing."""
     try:
         import matplotlib
     except ImportError:
@@ -126,7 +126,7 @@ def draw(found: list[Beside], path: Path) -> bool:
 
 
 def main() -> None:
-    """Run all, and write table and picture."""
+    """Run all benchmarks, and write table and picture."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help="small volumes and few views: some minutes")
     parser.add_argument("--output", type=Path, help="folder (default docs, with --quick out)")

@@ -1,4 +1,4 @@
-"""What is measured: views of the 80-module scanner, volumes, the float64 reference, and the rows of results."""
+"""Data of the benchmarks: views of the 80-module scanner, volumes, the float64 reference, and the rows of results."""
 
 from __future__ import annotations
 
@@ -37,24 +37,27 @@ class Case:
 
     @cached_property
     def grid(self) -> mph.Grid:
+        """The voxel grid, centred at the isocentre."""
         return mph.Grid.centered((self.voxels,) * 3, SIDE / self.voxels)
 
     @cached_property
     def system(self) -> mph.PinholeSystem:
+        """The scanner of the chosen modules."""
         every = mph.read_system(WORKBOOK)
         return every[np.arange(self.n_views) * len(every) // max(8, self.n_views)]
 
     @cached_property
     def views(self) -> mph.Views:
+        """The views of the images."""
         return self.system.views((self.pixels, self.pixels))
 
     def volume(self, name: str) -> Array:
-        """One of `save_volumes`'s, float32."""
+        """Return the volume `name` that `save_volumes` has written, float32."""
         return np.load(volume_path(self.folder, name, self.voxels))
 
     @cached_property
     def images(self) -> Array:
-        """What the adjoint is given: random numbers (n_views, n_v, n_u)."""
+        """The random images that the adjoint is applied to, (n_views, n_v, n_u)."""
         return np.random.default_rng(1).random((self.n_views, self.pixels, self.pixels), dtype=np.float32)
 
     @cached_property
@@ -71,11 +74,12 @@ class Case:
 
 
 def volume_path(folder: str | Path, name: str, voxels: int) -> Path:
+    """Return the path of the volume `name` with `voxels` voxels along each side."""
     return Path(folder) / f"{name}-{voxels}.npy"
 
 
 def save_volumes(folder: str | Path, voxels: int, names: tuple[str, ...] = ("noise", "smooth", "mu")) -> None:
-    """Volumes of a `Case`.
+    """Write volumes of a `Case`.
 
     - noise: independent numbers from 0 to 1, the hardest to skip or to interpolate;
     - smooth: broad blobs, in which all models of the integral agree, so that a shift of the rays shows;
@@ -139,11 +143,11 @@ class Reference:
     by_row: Array
 
     def error(self, images: Array) -> float:
-        """The largest difference, relative to the largest integral."""
+        """Return the largest difference from the reference, relative to the largest integral."""
         return float(np.abs(self._seen(images) - self.values[: len(images)]).max() / self.values.max())
 
     def offset(self, images: Array) -> tuple[float, float]:
-        """By how many pixels all is displaced, and by how much all is too bright (0: not)."""
+        """Return the displacement of the images, in pixels, and their relative excess brightness, by least squares."""
         n = len(images)
         expected = self.values[:n]
         terms = np.stack([expected, self.by_column[:n], self.by_row[:n]], axis=-1).reshape(-1, 3)
@@ -156,6 +160,7 @@ class Reference:
 
 
 def reference(case: Case, volume: str, k: int = 500) -> Reference:
+    """Compute the integrals in float64 at `k` random pixels of each view, and their change from pixel to pixel."""
     rng = np.random.default_rng(2)
     pixels = np.stack([rng.choice(case.pixels**2, min(k, case.pixels**2), replace=False) for _ in range(case.n_views)])
     array, views = case.volume(volume), case.views

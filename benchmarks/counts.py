@@ -34,7 +34,7 @@ ENOUGH = 5.0  # s
 
 
 def best(call: Callable[[], Any]) -> float:
-    """Seconds of the faster of two calls, or of one that takes long."""
+    """Return the seconds of the faster of two calls, or of a single one that takes long."""
     times: list[float] = []
     while len(times) < 2 and (not times or times[0] < ENOUGH):
         started = time.perf_counter()
@@ -44,7 +44,7 @@ def best(call: Callable[[], Any]) -> float:
 
 
 def worst_error(system: mph.PinholeSystem, size: float, views: mph.Views, model: mph.Emission) -> float:
-    """Largest relative error of the total counts in any module of single voxels of `size` mm around the isocentre."""
+    """Return the largest relative error of the total counts in any module, of single voxels of `size` mm."""
     rng = np.random.default_rng(1)
     ticks, weights = np.array([-1, 0, 1]) * np.sqrt(0.15) * size, np.array([5, 8, 5]) / 18
     steps = np.stack(np.meshgrid(ticks, ticks, ticks, indexing="ij"), axis=-1).reshape(-1, 3)
@@ -58,6 +58,7 @@ def worst_error(system: mph.PinholeSystem, size: float, views: mph.Views, model:
 
 
 def main() -> None:
+    """Print the table of rays, times and errors."""
     warnings.simplefilter("ignore", mph.InputWarning)
     system = mph.read_system(sys.argv[1] if len(sys.argv) > 1 else WORKBOOK)
     print(

@@ -25,7 +25,7 @@ WORKBOOK = Path(__file__).parents[1] / "examples" / "dc-spect-80.xlsx"
 
 
 def timed(call: Callable[[int], Any], modules: range) -> float:
-    """Seconds of the calls of all modules, after a first one; scaled from those that are called."""
+    """Return the seconds of all 80 modules' calls, after one to warm up; scaled from the modules that are called."""
     call(modules[-1])
     begun = time.perf_counter()
     for module in modules:
@@ -34,7 +34,7 @@ def timed(call: Callable[[int], Any], modules: range) -> float:
 
 
 def main() -> None:
-    """Print and tell the times."""
+    """Print and record the times."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--voxels", type=int, nargs=3, default=(512, 512, 133))
     parser.add_argument("--pixels", type=int, default=250)

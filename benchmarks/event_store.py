@@ -29,14 +29,14 @@ SHARDS = 50
 
 
 def timed(call: Callable[[], Any]) -> tuple[float, Any]:
-    """Seconds of wall time, and what the call gives."""
+    """Return the wall time of a call, s, and its result."""
     started = time.perf_counter()
     found = call()
     return time.perf_counter() - started, found
 
 
 def many(folder: Path, count: int) -> mph.events.EventRecipe:
-    """A set of `count` events, of which the last fiftieth is missing."""
+    """Make a set of `count` small events, of which the last fiftieth is missing, and return its recipe."""
     recipe = mph.events.EventRecipe(cases.recipe("line integrals", 16, 8).text + "[splits]\ntrain = 0.8\ntest = 0.2\n")
     target = SetFolder(folder)
     target.prepare(recipe, [range(count)], [])
@@ -52,7 +52,7 @@ def many(folder: Path, count: int) -> mph.events.EventRecipe:
 
 
 def memory(folder: Path, count: int) -> float:
-    """MB of a process that begins a shard of a set, on Linux."""
+    """Return the peak memory, MB, of a process that begins a shard of a set, on Linux."""
     code = (
         "import re, sys, mphdrr.core as mph; recipe = mph.events.read_recipe(sys.argv[1] + '/recipe.toml')\n"
         f"mph.events.making(recipe, sys.argv[1], {count}, shard=(7, {SHARDS}))\n"
@@ -62,7 +62,7 @@ def memory(folder: Path, count: int) -> float:
 
 
 def folder_work(count: int, place: str) -> None:
-    """Seconds of what looks at a whole set."""
+    """Print the seconds of the operations that look at a whole set."""
     with tempfile.TemporaryDirectory(dir=place) as name:
         folder = Path(name) / "set"
         recipe = many(folder, count)
@@ -81,7 +81,7 @@ def folder_work(count: int, place: str) -> None:
 
 
 def reading(count: int, place: str) -> None:
-    """Events a second through a loader of two workers, and processor time in one process, from files and from shards."""
+    """Print events per second through a loader of two workers, and processor time in one process, from files and shards."""
     import torch
 
     torch.set_num_threads(1)  # as in a loader's workers

@@ -65,7 +65,7 @@ angles = {angles}
 
 @dataclass(frozen=True)
 class Making:
-    """Events made in one go."""
+    """The time and the sizes of events made in one call."""
 
     model: str
     workers: int
@@ -81,7 +81,7 @@ class Making:
 
 
 def recipe(model: str, voxels: int, pixels: int) -> mph.events.EventRecipe:
-    """The recipe of the events."""
+    """Return the recipe of the events."""
     text = RECIPE.format(
         workbook=str(WORKBOOK), pixels=pixels, voxels=voxels, spacing=SIDE / voxels, radius=RADIUS, rods=list(RODS),
         height=HEIGHT, model=MODELS[model], angles=list(ANGLES),
@@ -90,7 +90,7 @@ def recipe(model: str, voxels: int, pixels: int) -> mph.events.EventRecipe:
 
 
 def made(model: str, workers: int, count: int, voxels: int, pixels: int, folder: str) -> Making:
-    """Make events in a new folder."""
+    """Make events in a new folder, and return their time and sizes."""
     with tempfile.TemporaryDirectory(dir=folder) as target, warnings.catch_warnings():
         warnings.simplefilter("ignore", mph.InputWarning)
         started = time.perf_counter()
@@ -102,7 +102,7 @@ def made(model: str, workers: int, count: int, voxels: int, pixels: int, folder:
 
 
 def painted(voxels: int, pose: np.ndarray) -> np.ndarray:
-    """The phantom as a script voxelizes it: coordinates of all voxels, a mask for each rod."""
+    """Voxelize the phantom as a script does: coordinates of all voxels, a mask for each rod."""
     at = ((np.arange(voxels) + 0.5) / voxels - 0.5).astype(np.float32) * np.float32(SIDE)
     turn, shift = pose[:3, :3].astype(np.float32), pose[:3, 3].astype(np.float32)
     x, y, z = (
@@ -118,7 +118,7 @@ def painted(voxels: int, pose: np.ndarray) -> np.ndarray:
 
 
 def parallel(volume: Any, angles: np.ndarray) -> Any:
-    """Parallel projections (angles, z, columns): the volume turned about z and summed, angle by angle, in torch."""
+    """Return parallel projections (angles, z, columns): the volume turned about z and summed, angle by angle, in torch."""
     import torch
 
     slices = volume.permute(2, 0, 1)[None]  # z as channels
@@ -131,7 +131,7 @@ def parallel(volume: Any, angles: np.ndarray) -> Any:
 
 
 def pipeline(voxels: int, pixels: int, views: int, angles: int, folder: str) -> dict[str, tuple[float, float]] | None:
-    """Seconds of the pipeline's steps for one event: as measured, and scaled to all views and angles.
+    """Return the seconds of the pipeline's steps for one event: as measured, and scaled to all views and angles.
 
     None where DiffDRR or torch is not installed.
     """
@@ -179,7 +179,7 @@ def section(
     makings: list[Making], peer: dict[str, tuple[float, float]] | None, views: int, angles: int, voxels: int, pixels: int,
     load: float, minutes: float,
 ) -> str:  # fmt: skip
-    """The section of the page."""
+    """Return the page's section on event sets."""
     threads = len(cores())
     lines = []
     for one in makings:
@@ -244,7 +244,7 @@ HEADING = report.EVENTS
 
 
 def write(text: str, path: Path) -> None:
-    """Put the section at the end of the page, in place of the one that was there."""
+    """Write the section at the end of the page, in place of the previous one."""
     page = path.read_text(encoding="utf-8") if path.is_file() else "# Benchmarks\n"
     path.write_text(f"{page.partition(HEADING)[0].rstrip()}\n\n{text}", encoding="utf-8")
     say(str(path))

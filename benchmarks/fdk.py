@@ -19,7 +19,7 @@ RADIUS, DISTANCE, MU = 500.0, 1000.0, 0.02
 
 
 def circle(n: int, pixels: int, pitch: float) -> Any:
-    """Views of a circle around z, as RTK's angles from 0 on."""
+    """Return views on a circle around z, at RTK's angles, which begin at 0."""
     import mphdrr.core as mph
 
     angle = 2 * np.pi * np.arange(n) / n
@@ -30,7 +30,7 @@ def circle(n: int, pixels: int, pitch: float) -> Any:
 
 
 def ball_images(views: Any, radius: float) -> np.ndarray:
-    """Exact line integrals of a ball in the middle."""
+    """Return exact line integrals of a ball at the isocentre."""
     images = []
     for m in range(len(views)):
         starts, ends = views.rays(m)
@@ -41,7 +41,7 @@ def ball_images(views: Any, radius: float) -> np.ndarray:
 
 
 def rtk(images: np.ndarray, n: int, voxels: int, size: float, pitch: float) -> Callable[[], np.ndarray]:
-    """A call of RTK's FDK; its volumes are turned, [y or x, z, x or y], which a ball does not mind."""
+    """Return a call of RTK's FDK. Its volumes have other axes, [y or x, z, x or y], which does not matter for a ball."""
     import itk
     from itk import RTK
 
@@ -69,7 +69,7 @@ def rtk(images: np.ndarray, n: int, voxels: int, size: float, pitch: float) -> C
 
 
 def ours(images: np.ndarray, views: Any, voxels: int, size: float) -> Callable[[], np.ndarray]:
-    """A call of `mph.fdk`."""
+    """Return a call of `mph.fdk`."""
     import mphdrr.core as mph
 
     grid = mph.Grid.centered(voxels, size)
@@ -77,7 +77,7 @@ def ours(images: np.ndarray, views: Any, voxels: int, size: float) -> Callable[[
 
 
 def main() -> None:
-    """Print times, their ratio and each one's value in the middle."""
+    """Print times, their ratio and each volume's central value."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     for name, default in (("voxels", 128), ("views", 180), ("threads", 2), ("turns", 3)):
         parser.add_argument(f"--{name}", type=int, default=default)

@@ -46,13 +46,13 @@ class Case:
     device: str
 
     def __getitem__(self, views: slice) -> Case:
-        """The same with some of the views."""
+        """Return the case with some of the views."""
         return replace(self, system=self.system[views], views=self.views[views], images=self.images[views])
 
 
 @dataclass(frozen=True)
 class Contender:
-    """What is timed: `forward` gives all images (M, n_v, n_u); its name, and for how many views a call is."""
+    """A program to be timed: `forward` returns all images (M, n_v, n_u); its name, and the views per call."""
 
     name: str
     n_views: int
@@ -62,6 +62,7 @@ class Contender:
 
 
 def main() -> None:
+    """Print a table of times and errors, or the reason why nothing can be measured."""
     arguments = parse_arguments()
     try:
         import torch
@@ -89,6 +90,7 @@ def main() -> None:
 
 
 def parse_arguments() -> argparse.Namespace:
+    """Parse the command line."""
     parser = argparse.ArgumentParser(description="The CUDA backend beside its peers.")
     parser.add_argument("--voxels", type=int, default=256, help="along each side of a 256 mm cube")
     parser.add_argument("--pixels", type=int, default=256, help="along each side of an image")
@@ -99,6 +101,7 @@ def parse_arguments() -> argparse.Namespace:
 
 
 def make_case(voxels: int, pixels: int, n_views: int, device: str) -> Case:
+    """Make views of `n_views` modules, and random volume and images on the device."""
     import torch
 
     system = mph.read_system(WORKBOOK)
@@ -113,7 +116,7 @@ def make_case(voxels: int, pixels: int, n_views: int, device: str) -> Case:
 
 
 def measure(case: Case, repeats: int = 5) -> list[tuple[Contender, float, float | None, float | None]]:
-    """Of every contender: forward and adjoint in ms a view, and the error of its first image."""
+    """Return every contender with forward and adjoint, ms a view, and the error of its first image."""
     found = list(contenders(case))
     reference = mph.Projector(case.grid, case.views[:1], backend="numpy")(case.volume.cpu().numpy())[0]
     errors = [error(c.forward(), reference) if c.same_integrals else None for c in found]
@@ -126,11 +129,12 @@ def measure(case: Case, repeats: int = 5) -> list[tuple[Contender, float, float 
 
 
 def error(images: Any, reference: np.ndarray) -> float:
+    """Return the largest difference of the first image from the reference, relative to the largest integral."""
     return float(np.abs(images[0].detach().cpu().numpy() - reference).max() / reference.max())
 
 
 def timed(calls: list[Call], repeats: int, device: str) -> list[float]:
-    """Best time of each in s, the calls taking turns."""
+    """Return the best time of each call, s; the calls take turns."""
     import torch
 
     wait = torch.cuda.synchronize if device == "cuda" else lambda: None
@@ -147,6 +151,7 @@ def timed(calls: list[Call], repeats: int, device: str) -> list[float]:
 
 
 def contenders(case: Case) -> Iterator[Contender]:
+    """Yield all contenders; print the reason where a peer cannot be measured."""
     yield from ours(case)
     for make in (diffdrr, nanodrr, astra):
         try:
@@ -156,6 +161,7 @@ def contenders(case: Case) -> Iterator[Contender]:
 
 
 def ours(case: Case) -> Iterator[Contender]:
+    """Yield the contenders of mphDRR."""
     import torch
 
     n, one = len(case.views), case[:1]
@@ -183,7 +189,7 @@ def ours(case: Case) -> Iterator[Contender]:
 
 
 def rays(case: Case) -> list[tuple[Any, Any]]:
-    """The ends of every view's rays, (N, 3) in world mm."""
+    """Return the ends of every view's rays, (N, 3) in world mm."""
     import torch
 
     views = [case.views.rays(m) for m in range(len(case.views))]
@@ -191,7 +197,7 @@ def rays(case: Case) -> list[tuple[Any, Any]]:
 
 
 def by_autograd(case: Case, name: str, volume: Any, render: Callable[[Any, Any], Any], limit: int) -> Contender:
-    """A renderer in torch; `render` makes the image of one view, `limit` is how many views are tried."""
+    """Return the contender of a renderer in torch: `render` makes the image of one view, `limit` is the number of views."""
     import torch
 
     views = rays(case[:limit])
@@ -210,6 +216,7 @@ def by_autograd(case: Case, name: str, volume: Any, render: Callable[[Any, Any],
 
 
 def diffdrr(case: Case) -> Contender:
+    """Return the contender of DiffDRR."""
     import torch
     from diffdrr.renderers import Siddon
 
@@ -225,6 +232,7 @@ def diffdrr(case: Case) -> Contender:
 
 
 def nanodrr(case: Case) -> Contender:
+    """Return the contender of nanodrr."""
     import torch
     from nanodrr.drr.backends import render_fused, render_torch
 
@@ -250,6 +258,7 @@ def nanodrr(case: Case) -> Contender:
 
 
 def astra(case: Case) -> Contender:
+    """Return the contender of ASTRA."""
     import astra
     import torch
 

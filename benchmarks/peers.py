@@ -61,10 +61,13 @@ class Peer:
 
     @classmethod
     def tasks(cls) -> tuple[str, ...]:
+        """Return the names of the tasks that the contender can do."""
         return tuple(task for task in TASKS if hasattr(cls, task))
 
 
 class Ours(Peer):
+    """The contender of one of mphDRR's backends."""
+
     backend = ""
 
     def __init__(self, threads: int) -> None:
@@ -82,14 +85,17 @@ class Ours(Peer):
         return mph.Projector(case.grid, case.views, model, self.backend, threads=self.threads)
 
     def forward(self, case: Case, volume: str = "noise") -> Call:
+        """Prepare the line integrals of `volume`."""
         A, x = self._projector(case), case.volume(volume)
         return lambda: A(x)
 
     def adjoint(self, case: Case) -> Call:
+        """Prepare the adjoint of the case's images."""
         A, images = self._projector(case), case.images
         return lambda: A.T(images)
 
     def emission(self, case: Case) -> Call:
+        """Prepare the attenuated counts of the ideal pinhole."""
         mu = mph.Volume(case.volume("mu"), case.grid, "mu")
         # One ray a pixel, through the middle of the hole, as all contenders.
         model = mph.Emission(case.system, mu, hole="point", pixel_points=1, tolerance=1e9)
@@ -97,6 +103,7 @@ class Ours(Peer):
         return lambda: A(x)
 
     def pose_gradient(self, case: Case) -> Call:
+        """Prepare the images' derivatives by the poses."""
         from mphdrr.core.projector.torch_cameras import pinhole_images
 
         volume = mph.Volume(case.volume("smooth"), case.grid)
@@ -109,7 +116,7 @@ class Ours(Peer):
 
 
 def ours(backend: str) -> type[Ours]:
-    """The contender of one of mphDRR's backends."""
+    """Return the contender class of one of mphDRR's backends."""
     label = f"mphDRR, {backend}" + (" (float64)" if backend == "numpy" else "")
     facts = {"backend": backend, "label": label, "slow": backend in ("torch", "numpy"), "cpu": backend != "cuda"}
     return type(backend, (Ours,), facts)
@@ -139,14 +146,17 @@ class PlainC(Peer):
             shutil.rmtree(folder)
 
     def forward(self, case: Case, volume: str = "noise") -> Call:
+        """Prepare the line integrals of `volume`."""
         return self._images(case, self._library.forward, case.volume(volume))
 
     def emission(self, case: Case) -> Call:
+        """Prepare the attenuated counts of the ideal pinhole."""
         weights = case.emission_weights
         call = self._images(case, self._library.attenuated, case.volume("noise"), case.volume("mu"))
         return lambda: weights * call()
 
     def adjoint(self, case: Case) -> Call:
+        """Prepare the adjoint of the case's images."""
         images, geometry = case.images, self._geometry(case)
 
         def call() -> np.ndarray:
@@ -198,14 +208,17 @@ class Rtk(Peer):
         self.label = f"itk-rtk {version('itk-rtk')} (Joseph)"
 
     def forward(self, case: Case, volume: str = "noise") -> Call:
+        """Prepare the line integrals of `volume`."""
         return self._images(case, self._rtk.JosephForwardProjectionImageFilter, volume)
 
     def emission(self, case: Case) -> Call:
+        """Prepare the attenuated counts of the ideal pinhole."""
         weights = case.emission_weights
         call = self._images(case, self._rtk.JosephForwardAttenuatedProjectionImageFilter, "noise", "mu")
         return lambda: weights * call()
 
     def adjoint(self, case: Case) -> Call:
+        """Prepare the adjoint of the case's images."""
         geometry, stack = self._geometry(case), self._stack(case, case.images)
 
         def call() -> np.ndarray:
@@ -273,6 +286,7 @@ class Plastimatch(Peer):
         self.own_seconds = 0.0
 
     def forward(self, case: Case, volume: str = "noise") -> Call:
+        """Prepare the line integrals of `volume`."""
         folder = tempfile.TemporaryDirectory(prefix="mphdrr-plastimatch-", dir=case.folder)
         file = Path(folder.name) / "volume.mha"
         n, size, origin = case.voxels, case.grid.spacing, case.grid.affine[:3, 3]
@@ -325,10 +339,11 @@ class TorchPeer(Peer):
         self._torch = torch
 
     def renderer(self, case: Case, volume: Any) -> Callable[[Any, Any], Any]:
-        """Integrals (N,) of `volume`, a tensor, along rays between world points (N, 3)."""
+        """Return a function that integrates `volume`, a tensor, along rays between world points (N, 3)."""
         raise NotImplementedError
 
     def forward(self, case: Case, volume: str = "noise") -> Call:
+        """Prepare the line integrals of `volume`."""
         torch = self._torch
         render = self.renderer(case, torch.from_numpy(case.volume(volume)))
         rays = [[torch.from_numpy(np.array(ends)) for ends in case.views.rays(m)] for m in range(case.n_views)]
@@ -341,6 +356,7 @@ class TorchPeer(Peer):
         return call
 
     def adjoint(self, case: Case) -> Call:
+        """Prepare the adjoint of the case's images."""
         torch = self._torch
         volume = torch.zeros(case.grid.shape, requires_grad=True)
         render = self.renderer(case, volume)
@@ -357,6 +373,7 @@ class TorchPeer(Peer):
         return call
 
     def pose_gradient(self, case: Case) -> Call:
+        """Prepare the images' derivatives by the poses."""
         from mphdrr.core.projector.torch_cameras import pinhole_rays
 
         torch = self._torch
@@ -378,6 +395,8 @@ class TorchPeer(Peer):
 
 
 class DiffDRR(TorchPeer):
+    """DiffDRR's renderer by Siddon's method, in world coordinates."""
+
     label = "DiffDRR (exact)"
 
     def __init__(self, threads: int) -> None:
@@ -388,6 +407,7 @@ class DiffDRR(TorchPeer):
         self.label = f"DiffDRR {version('diffdrr')} (Siddon)"
 
     def renderer(self, case: Case, volume: Any) -> Callable[[Any, Any], Any]:
+        """Return the function that renders rays through `volume`."""
         to_index = self._torch.from_numpy(np.array(case.grid.index_from_world))
 
         def render(sources: Any, targets: Any) -> Any:
@@ -399,7 +419,7 @@ class DiffDRR(TorchPeer):
 
 
 class NanoDRR(TorchPeer):
-    """Samples of the interpolated volume, as many as it takes by default."""
+    """nanodrr's renderer, which samples the interpolated volume; the number of samples is its default."""
 
     model, samples = "500 samples", 500
     label = "nanodrr"
@@ -412,6 +432,7 @@ class NanoDRR(TorchPeer):
         self.label = f"nanodrr {version('nanodrr')} (torch)"
 
     def renderer(self, case: Case, volume: Any) -> Callable[[Any, Any], Any]:
+        """Return the function that renders rays through `volume`."""
         torch = self._torch
         # grid_sample wants (D, H, W) voxels and, as points, (x, y, z) in -1..1 from face to face of (W, H, D).
         normalized = np.diag([*(2 / np.array(case.grid.shape)), 1.0])
@@ -433,6 +454,8 @@ class NanoDRR(TorchPeer):
 
 
 class DiffCT(Peer):
+    """diffct's projector of cone beams."""
+
     label = "diffct"
     slow = True
 
@@ -446,10 +469,12 @@ class DiffCT(Peer):
         self.label = f"diffct {version('diffct')} (torch)"
 
     def forward(self, case: Case, volume: str = "noise") -> Call:
+        """Prepare the line integrals of `volume`."""
         A, x = self._projector(case), self._torch.from_numpy(np.ascontiguousarray(case.volume(volume).T))
         return lambda: A.project(x).mT.numpy()
 
     def adjoint(self, case: Case) -> Call:
+        """Prepare the adjoint of the case's images."""
         A, images = self._projector(case), self._torch.from_numpy(case.images).mT.contiguous()
         return lambda: A.backproject(images).numpy().T
 
@@ -476,7 +501,7 @@ PEERS: dict[str, type[Peer]] = {
 
 
 def _pose_gradient(case: Case, integrate: Callable[[int, Any], Any]) -> Call:
-    """The call of a differentiable renderer ``integrate(m, (position, rotation, distance, pitch))``."""
+    """Return the call of a differentiable renderer ``integrate(m, (position, rotation, distance, pitch))``."""
     import torch
 
     from mphdrr.core.geometry.rotations import se3_exp
@@ -511,11 +536,11 @@ def _words(numbers: np.ndarray) -> str:
 
 
 def set_thread_variables(environment: dict[str, str], threads: int) -> None:
-    """What libraries look at when they are loaded."""
+    """Set the environment variables that libraries read when they are loaded."""
     for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "ITK_GLOBAL_DEFAULT_NUMBER_OF_THREADS"):
         environment[name] = str(threads)
 
 
 def cores() -> list[int]:
-    """The cores that this process may use."""
+    """Return the processor cores that this process may use."""
     return sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else list(range(os.cpu_count() or 1))

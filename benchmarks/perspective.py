@@ -21,7 +21,7 @@ SIDE = 150.0  # mm, of the volume
 
 
 def scipys_sum(images: np.ndarray, views: Any, grid: Any) -> Callable[[], np.ndarray]:
-    """The sum over views by scipy."""
+    """Return the call that back-projects the sum over views with scipy."""
     from scipy.ndimage import map_coordinates
 
     def call() -> np.ndarray:

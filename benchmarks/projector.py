@@ -55,12 +55,13 @@ class Worker:
         self.label = ""
 
     def wait(self) -> str | None:
-        """Until it is ready; why it is not to be had, if so."""
+        """Wait until the process is ready; return the reason why the contender is missing, or None."""
         first = self._read()
         self.label = first.get("label", "")
         return first.get("missing", first.get("failed"))
 
     def measure(self, case: Case, task: str, **request: Any) -> dict[str, Any]:
+        """Ask the process to do a task of a case; return its answer, which has "failed" where it ended."""
         assert self._process.stdin is not None
         started = time.monotonic()
         end = threading.Timer(TOO_LONG, self._process.kill)
@@ -77,10 +78,11 @@ class Worker:
 
     @property
     def exhausted(self) -> bool:
-        """Whether it has taken long enough; not the reference, which is needed."""
+        """Whether the contender has used its share of time; never the reference, which is needed."""
         return PEERS[self.name].slow and self.name != "numpy" and self._spent > ENOUGH
 
     def close(self) -> None:
+        """End the process."""
         assert self._process.stdin is not None
         with contextlib.suppress(BrokenPipeError):
             self._process.stdin.close()
@@ -93,6 +95,7 @@ class Worker:
 
 
 def main() -> None:
+    """Measure all contenders, and write the page."""
     arguments = parse_arguments()
     started = time.monotonic()
     with tempfile.TemporaryDirectory(prefix="mphdrr-bench-") as folder:
@@ -124,6 +127,7 @@ def main() -> None:
 
 
 def parse_arguments() -> argparse.Namespace:
+    """Parse the command line, with the defaults of a quick or a full run."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help="96 voxels and pixels, 2 rounds: a minute or two")
     parser.add_argument("--voxels", type=int, help="along each side of the cube (default 256)")
@@ -146,7 +150,7 @@ def parse_arguments() -> argparse.Namespace:
 
 
 def start(names: list[str], available: list[int]) -> tuple[list[Worker], dict[str, str]]:
-    """The contenders that can be had, and why the others cannot."""
+    """Start the contenders; return those that are installed, and why the others are missing."""
     workers = []
     for name in names:
         one_thread_too = PEERS[name].cpu and not PEERS[name].slow
@@ -162,7 +166,7 @@ def start(names: list[str], available: list[int]) -> tuple[list[Worker], dict[st
 
 
 def compare(workers: list[Worker], case: Case, rounds: int) -> dict[tuple[str, int], Row]:
-    """Every task of every contender, in turns."""
+    """Measure every task of every contender, in turns."""
     small = replace(case, voxels=16, pixels=8, n_views=1)
     save_volumes(case.folder, small.voxels)
     rows = {}
@@ -197,7 +201,7 @@ def compare(workers: list[Worker], case: Case, rounds: int) -> dict[tuple[str, i
 
 
 def check_rays(workers: list[Worker], case: Case, rows: dict[tuple[str, int], Row]) -> None:
-    """Errors of the line integrals; that all look along the same rays."""
+    """Measure errors of the line integrals, and whether all contenders use the same rays."""
     noise, smooth = (reference(case, volume) for volume in ("noise", "smooth"))
     for w in workers:
         row, images = rows[w.name, w.threads], load(case, w.name, w.threads, "forward")
@@ -210,7 +214,7 @@ def check_rays(workers: list[Worker], case: Case, rows: dict[tuple[str, int], Ro
 
 
 def check_others(workers: list[Worker], case: Case, rows: dict[tuple[str, int], Row]) -> None:
-    """Errors of the other tasks."""
+    """Measure errors of the other tasks."""
     of_numpy = {task: load(case, "numpy", len(cores()), task) for task in ("emission", "pose_gradient")}
     for w in workers:
         row = rows[w.name, w.threads]
@@ -226,7 +230,7 @@ def check_others(workers: list[Worker], case: Case, rows: dict[tuple[str, int], 
 
 
 def scale(workers: dict[str, Worker], case: Case) -> list[report.Point]:
-    """How the time grows with voxels, rays and views, and with what is in the volume."""
+    """Measure how the time grows with voxels, rays and views, and how it depends on the content of the volume."""
     cases = [
         ("voxels", replace(case, voxels=n)) for n in (case.voxels // 4, case.voxels // 2, case.voxels, case.voxels * 2)
     ]
@@ -247,6 +251,7 @@ def scale(workers: dict[str, Worker], case: Case) -> list[report.Point]:
 def measured(
     workers: dict[str, Worker], what: str, case: Case, task: str, turns: int, **request: Any
 ) -> list[report.Point]:
+    """Measure one task of one case; return the best time of each contender."""
     best: dict[str, float] = {}
     for _ in range(turns):
         for name, worker in workers.items():
@@ -259,15 +264,18 @@ def measured(
 
 
 def result_path(case: Case, worker: Worker, task: str) -> Path:
+    """Return the path of the file for a contender's result."""
     return Path(case.folder) / f"result-{worker.name}-{worker.threads}-{task}.npy"
 
 
 def load(case: Case, name: str, threads: int, task: str) -> np.ndarray | None:
+    """Load a contender's result; None where there is none."""
     path = Path(case.folder) / f"result-{name}-{threads}-{task}.npy"
     return np.load(path) if path.is_file() else None
 
 
 def say(words: str) -> None:
+    """Print at once."""
     print(words, flush=True)
 
 

@@ -31,6 +31,7 @@ Contender = Callable[[int, int], Any]
 
 
 def main() -> None:
+    """Print the table of times and differences."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--workbook", default=WORKBOOK)
     for name, default in (("voxels", 64), ("pixels", 64), ("subsets", 16), ("iterations", 4), ("rounds", 2)):
@@ -65,7 +66,7 @@ def main() -> None:
 
 
 def problem(workbook: str | Path, voxels: int, pixels: int) -> tuple[mph.Projector, np.ndarray]:
-    """A projector, and counts from a grid twice as fine through more points of the hole."""
+    """Return a projector, and counts simulated on a grid twice as fine with more points of the hole."""
     system = mph.read_system(workbook)
     views = system.views((pixels, pixels), "real")
     physics: dict[str, Any] = {"time": 600.0, "isotope": "Tc-99m", "aperture_mu": "tungsten", "crystal_mu": "NaI"}
@@ -78,16 +79,19 @@ def problem(workbook: str | Path, voxels: int, pixels: int) -> tuple[mph.Project
 
 
 def seconds(call: Callable[..., Any], *arguments: Any) -> float:
+    """Return the wall time of a call."""
     started = time.perf_counter()
     call(*arguments)
     return time.perf_counter() - started
 
 
 def ours(A: mph.Projector, counts: np.ndarray) -> Contender:
+    """Return mphDRR's OSEM as a contender."""
     return lambda iterations, subsets: mph.osem(A, counts, iterations, subsets).volume.array
 
 
 def pytomography_loops(A: mph.Projector, counts: np.ndarray) -> dict[str, Contender]:
+    """Return PyTomography's OSEM as a contender; none where it is not installed."""
     if importlib.util.find_spec("pytomography") is None:
         return {}
     matrix = mph.pytomography_matrix(A)
@@ -100,6 +104,7 @@ def pytomography_loops(A: mph.Projector, counts: np.ndarray) -> dict[str, Conten
 
 
 def deepinv_loops(A: mph.Projector, counts: np.ndarray) -> dict[str, Contender]:
+    """Return deepinv's MLEM and OSEM as a contender; none where it is not installed."""
     if importlib.util.find_spec("deepinv") is None:
         return {}
     import torch

@@ -1,4 +1,4 @@
-"""What `projector.py` measured, as a Markdown page and a plot."""
+"""The measurements of `projector.py` as a Markdown page and a plot."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class Point:
 
 @dataclass(frozen=True)
 class Results:
-    """All of a run."""
+    """All measurements of a run."""
 
     case: Case
     rows: dict[tuple[str, int], Row]
@@ -53,7 +53,7 @@ class Results:
 
 
 def write(results: Results, folder: Path) -> None:
-    """``benchmarks.md``, and where matplotlib is there, ``images/benchmarks.svg``."""
+    """Write ``benchmarks.md``, and, where matplotlib is installed, ``images/benchmarks.svg``."""
     picture = folder / "images" / "benchmarks.svg"
     drawn = draw(results, picture)
     path = folder / "benchmarks.md"
@@ -64,6 +64,7 @@ def write(results: Results, folder: Path) -> None:
 
 
 def page(results: Results, picture: Path | None) -> str:
+    """Return the page, with a link to the picture if there is one."""
     case = results.case
     parts = [
         "# Benchmarks",
@@ -103,6 +104,7 @@ NOTES = """- *emission*: counts of the ideal pinhole, attenuated between voxel a
 
 
 def table(results: Results) -> str:
+    """Return the table of times, errors and memory."""
     head = [
         "projector", "integral", "threads", *(f"{title} ms" for title in TITLES.values()), "error", "offset px", "mismatch",
         "error of emission", "of gradient", "memory MB",
@@ -127,11 +129,12 @@ def table(results: Results) -> str:
 
 
 def has_recorded(case: Case) -> bool:
-    """Whether the work is that of `RECORDED`."""
+    """Return whether the work is that of `RECORDED`."""
     return (case.n_views, case.pixels, case.voxels) == RECORDED_WORK
 
 
 def ratios(results: Results) -> str:
+    """Return the table of ratios of mphDRR's times to its peers' and among each other."""
     ours = results.rows.get(("cpu", results.threads))
     if ours is None or "forward" not in ours.seconds:
         return "mphDRR's cpu backend was not measured."
@@ -161,7 +164,7 @@ def _ratio(a: Row, task: str, b: Row, other: str) -> list[str]:
 
 
 def growth(results: Results) -> str:
-    """Times of mphDRR and of plain C, and per voxel that a ray passes."""
+    """Return the table of times of mphDRR and of plain C, with the time per voxel that a ray passes."""
     lines = []
     for point in results.scaling:
         case, n = point.case, voxel_steps(point.case)
@@ -178,7 +181,7 @@ def growth(results: Results) -> str:
 
 
 def voxel_steps(case: Case) -> float:
-    """How many voxels the rays of all views pass, about: for each axis the planes crossed."""
+    """Return the approximate number of voxels that the rays of all views pass: the planes crossed along each axis."""
     total = 0.0
     for m in range(case.n_views):
         source, targets = case.views.rays(m)
@@ -192,6 +195,7 @@ def voxel_steps(case: Case) -> float:
 
 
 def machine(results: Results) -> str:
+    """Return a paragraph about the machine and its software, with a warning where it was busy."""
     found = versions()
     names = {"python": "Python", "numpy": "numpy", "torch": "torch", "cpu": "kernels for"}
     software = ", ".join(f"{names[name]} {found[name]}" for name in names if name in found)
@@ -215,6 +219,7 @@ def machine(results: Results) -> str:
 
 
 def processor() -> str:
+    """Return the processor's name."""
     information = Path("/proc/cpuinfo")
     if information.is_file():
         for line in information.read_text().splitlines():
@@ -224,7 +229,7 @@ def processor() -> str:
 
 
 def draw(results: Results, path: Path) -> bool:
-    """The plot; False without matplotlib."""
+    """Draw the plot to `path`; return False where matplotlib is missing."""
     try:
         import matplotlib
     except ImportError:

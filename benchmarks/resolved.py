@@ -43,12 +43,12 @@ WATER_MU = 0.0154  # 1/mm, of Tc-99m's photons
 
 
 def grid(n: int) -> mph.Grid:
-    """`n`^3 voxels over the field; 128 x 128 x 64 over its middle, in which the rods are."""
+    """Return `n`^3 voxels over the field; for n = 128, 128 x 128 x 64 over its central part, which holds the rods."""
     return mph.Grid.centered((n, n, 64 if n == 128 else n), FIELD / n)
 
 
 def projector(n: int, blur: float = 1.0, **model: Any) -> mph.Projector:
-    """The scanner's projector for `n`^3 voxels."""
+    """Return the scanner's projector for `n`^3 voxels."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", mph.InputWarning)
         views = SYSTEM.views(shape=(PIXELS, PIXELS))
@@ -56,7 +56,7 @@ def projector(n: int, blur: float = 1.0, **model: Any) -> mph.Projector:
 
 
 def counts(folder: Path, blur: float = 1.0) -> np.ndarray:
-    """The noise-free counts, made once."""
+    """Return the noise-free counts, from their file where it exists."""
     path = folder / f"counts-{blur:g}.npy"
     if not path.exists():
         np.save(path, projector(256, blur, **TRUE_POINTS)(PHANTOM.voxelize(grid(256))))
@@ -64,7 +64,7 @@ def counts(folder: Path, blur: float = 1.0) -> np.ndarray:
 
 
 def reconstruct(folder: Path, name: str, data: np.ndarray, n: int, iterations: int, **model: Any) -> dict[str, Any]:
-    """Reconstruct, score and keep; the scores at some iterations on the way, too."""
+    """Reconstruct, score and save; return the scores by iteration."""
     A = projector(n, **model)
     started = time.perf_counter()
     history: dict[int, Any] = {}
@@ -82,7 +82,7 @@ def reconstruct(folder: Path, name: str, data: np.ndarray, n: int, iterations: i
 
 
 def cylinder(folder: Path, diameter: float = 200.0, height: float = 60.0, iterations: int = 10) -> dict[str, float]:
-    """Activity in the middle of a uniform cylinder of water over the truth, with and without attenuation in the model.
+    """Return the relative activity at the centre of a uniform cylinder of water, with and without attenuation in the model.
 
     The modules see 150 mm, so all counts are from within the crystals: the whole cylinder is reconstructed.
     """
@@ -112,7 +112,7 @@ def cylinder(folder: Path, diameter: float = 200.0, height: float = 60.0, iterat
 
 
 def picture(folder: Path, names: list[str], path: Path, tile: int = 260) -> None:
-    """The middle slices of the truth and of reconstructions in `folder`, side by side, black and white as of the truth."""
+    """Draw the central slices of the truth and of reconstructions in `folder`, side by side, on the truth's grey scale."""
     from PIL import Image
 
     with warnings.catch_warnings():
@@ -129,7 +129,7 @@ def picture(folder: Path, names: list[str], path: Path, tile: int = 260) -> None
 
 
 def scores(volume: mph.Volume) -> list[dict[str, float]]:
-    """Of each sector: rod diameter, whether it is resolved, share of its pairs, mean valley / peak, contrast recovery."""
+    """Return the scores of each sector: the fields of `derenzo_score` that the page shows."""
     score = mph.derenzo_score(volume, PHANTOM)
     return [
         {

@@ -21,7 +21,7 @@ _AIMS = {
 
 
 def least(act: Callable[[int], object], prepare: Callable[[int], object] = lambda n: None) -> float:
-    """The least processor time of some calls, ms, each after what prepares it."""
+    """Return the least processor time of some calls, ms, each after its preparation."""
     times = []
     for n in range(_TIMES):
         prepare(n)
@@ -32,7 +32,7 @@ def least(act: Callable[[int], object], prepare: Callable[[int], object] = lambd
 
 
 def move(count: int) -> Callable[[int], None]:
-    """What moves that many modules to and fro."""
+    """Return a function that moves the first `count` modules to and fro."""
 
     def moving(n: int) -> None:
         cameras = [item for item in bpy.context.scene.objects if item.mphdrr_module.is_module]
@@ -43,13 +43,13 @@ def move(count: int) -> Callable[[int], None]:
 
 
 def follow(n: int = 0) -> None:
-    """Have Blender calculate the scene, and again what handlers changed."""
+    """Have Blender evaluate the scene, and once more after the changes by handlers."""
     bpy.context.view_layer.update()
     bpy.context.view_layer.update()
 
 
 def push(change: Callable[[int], object]) -> Callable[[int], None]:
-    """What makes an undo step of a change, followed."""
+    """Return a function that makes a change, evaluates the scene and stores an undo step."""
 
     def pushing(n: int) -> None:
         change(n)
@@ -60,7 +60,7 @@ def push(change: Callable[[int], object]) -> Callable[[int], None]:
 
 
 def rename(n: int) -> None:
-    """Change what nothing follows."""
+    """Change a name that no handler depends on."""
     bpy.context.scene.name = f"Scene {n}"
 
 
@@ -71,7 +71,7 @@ def undo(n: int) -> None:
 
 
 def measured(file: str) -> dict[str, float]:
-    """Milliseconds of each, in the order of `_AIMS`."""
+    """Return the milliseconds of each task, in the order of `_AIMS`."""
     bpy.ops.wm.open_mainfile(filepath=file)
     found = [least(follow, move(count)) for count in (80, 1)]
     window = bpy.context.window_manager.windows[:1]

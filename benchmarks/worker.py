@@ -32,6 +32,7 @@ _UNIT = 1.0 if sys.platform == "darwin" else 1024.0  # of ru_maxrss
 
 
 def main() -> None:
+    """Answer requests until standard input ends."""
     # Libraries may print what they like: their words go to standard error.
     answers = os.fdopen(os.dup(1), "w")
     os.dup2(2, 1)
@@ -79,14 +80,14 @@ def main() -> None:
 
 
 def resident() -> float:
-    """Memory in use, bytes."""
+    """Return the memory in use, bytes."""
     import psutil
 
     return float(psutil.Process().memory_info().rss)
 
 
 def peak() -> float:
-    """Most memory in use since `reset_peak`, bytes; where the system does not tell, since the start."""
+    """Return the largest memory in use since `reset_peak`, bytes; where the system does not tell, since the start."""
     status = Path("/proc/self/status")
     if status.is_file():
         return 1024.0 * next(float(s.split()[1]) for s in status.read_text().splitlines() if s.startswith("VmHWM"))
@@ -94,17 +95,18 @@ def peak() -> float:
 
 
 def peak_of_programs() -> float:
-    """Most memory in use of any program that was called, bytes."""
+    """Return the largest memory in use of any program that was called, bytes."""
     return 0.0 if resource is None else _UNIT * resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss
 
 
 def reset_peak() -> None:
+    """Reset the peak that `peak` reads, where the system allows it."""
     with contextlib.suppress(OSError):
         Path("/proc/self/clear_refs").write_text("5")
 
 
 def cpu_seconds() -> float:
-    """Of all threads and of the programs called."""
+    """Return the processor time of all threads and of the programs called, s."""
     return time.process_time() + sum(os.times()[2:4])
 
 

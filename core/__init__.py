@@ -7,10 +7,20 @@ Everything imported here is the public interface. Arguments that cannot be used 
 >>> views = system.views(shape=(256, 256))
 >>> grid = mph.Grid.centered((128, 128, 128), 1.0)
 >>> images = mph.Projector(grid, views)(mph.DerenzoPhantom(40, (8, 6, 5, 4, 3, 2), 40).voxelize(grid))
+
+Each folder is a room, whose docstring says what it is for and how to add to it; docs/structure.md says which rooms it may
+import. A public name is a line below. Files of this folder that all rooms use:
+
+- errors.py: `InputError`, `InputWarning`, and `needing` around the import of a package that may be
+  missing; in Blender it refers to docs/first-steps.md, which says how packages get there.
+- files.py: the only file that writes files, by `replacing`, `new_folder` or `write_bytes`; hdf5.py: sealed HDF5 files.
+- validation.py, arrays.py (types of arrays), memory.py, progress.py, recording.py, cache.py.
+- scanner_kinds.py and method_files.py join rooms: the kinds of scanners, and of files that are methods.
 """
 
 from typing import TYPE_CHECKING
 
+from . import method_files as method_files  # enters its rows into the registry of `reconstruction`
 from .lazy import public
 
 if TYPE_CHECKING:

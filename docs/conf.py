@@ -1,4 +1,4 @@
-"""How the pages of this folder become the site: `make docs`."""
+"""Configuration of Sphinx, which makes the site from the pages of this folder: `make docs`."""
 
 import argparse
 import ast
@@ -49,9 +49,9 @@ _PUBLIC = Path(mph.__file__)
 
 
 def public_names() -> dict[str, list[str]]:
-    """The names of `mphdrr.core`, by the room (or file) of core that they come from, in the order of its imports.
+    """Return the names of `mphdrr.core`, by the room (or file) of core that they come from, in the order of its imports.
 
-    Those of a room with names of its own, ``mph.events``, begin with its name.
+    Names of a room with names of its own, ``mph.events``, begin with the room's name.
     """
     rooms: dict[str, list[str]] = {}
     body = ast.parse(_PUBLIC.read_text(encoding="utf-8")).body
@@ -94,7 +94,7 @@ class Commands(SphinxDirective):
     """``{commands}``: the help of every command, as the program prints it."""
 
     def run(self) -> list[nodes.Node]:
-        """Ask the parsers."""
+        """Return the sections of all commands, from their parsers."""
         os.environ["COLUMNS"] = "88"
         return _sections(build_parser(COMMANDS))
 
@@ -125,7 +125,7 @@ def _shorter(
 
 
 def setup(app: Sphinx) -> None:
-    """Add what is defined here."""
+    """Register this file's directives and handlers."""
     app.add_directive("public-names", PublicNames)
     app.add_directive("commands", Commands)
     app.connect("autodoc-process-signature", _shorter)

@@ -1,4 +1,4 @@
-"""Workbook, phantom, projections and dataset in Blender without a window:
+"""Make workbook, phantom, projections and dataset in Blender without a window.
 
     blender --background --python examples/batch.py -- scanner.xlsx folder
 

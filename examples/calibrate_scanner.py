@@ -25,6 +25,7 @@ PHYSICS = {"isotope": "Tc-99m", "aperture_mu": "tungsten", "crystal_mu": "NaI", 
 
 
 def main() -> None:
+    """Simulate the misaligned scanner, calibrate it, and print and draw the reconstructions."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("workbook", nargs="?", default=WORKBOOK, help="the scanner's geometry workbook")
     parser.add_argument("--picture", default="calibration.png", help="file for a slice of each reconstruction")
@@ -73,7 +74,7 @@ def main() -> None:
 
 
 def draw(volumes: dict[str, mph.Volume], truth: mph.Volume, pose: np.ndarray) -> Page:
-    """The slices across the rods, side by side, in the same colors."""
+    """Draw the slices across the rods, side by side, in the same colors."""
     plane = mph.Grid.centered((160, 160, 1), 0.5)
     across = mph.Grid(plane.shape, pose @ plane.affine)
     display, side, gap = Display(colors="inferno"), 300, 20

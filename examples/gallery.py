@@ -1,10 +1,9 @@
-"""Pictures of every phantom, a CT, the scanner's sensitivity, back-projections, events and the demo: `make gallery` writes
-them to docs/images.
+"""Draw every phantom, a CT, the scanner's sensitivity, back-projections, events and the demo.
 
     python examples/gallery.py FOLDER [CT]
 
-CT is a volume file of CT numbers; without it, its pictures are omitted. The pictures in the scanner need Blender's Python
-module (bpy).
+`make gallery` writes the pictures to docs/images. CT is a volume file of CT numbers; without it, its pictures are omitted.
+The pictures in the scanner need Blender's Python module (bpy).
 """
 
 from __future__ import annotations
@@ -63,13 +62,13 @@ def keep(picture: Image.Image, path: Path) -> None:
 
 
 def grid_of(phantom: mph.Phantom) -> mph.Grid:
-    """A grid that contains a phantom."""
+    """Return a grid that contains a phantom."""
     voxels = 160
     return mph.Grid.centered(voxels, phantom.extent / (voxels - 2))
 
 
 def sheet(system: mph.PinholeSystem, volumes: dict[str, mph.Volume]) -> Image.Image:
-    """Two columns of volumes: slices across z, y and x of each, and its projection."""
+    """Draw two columns of volumes: slices across z, y and x of each, and its projection."""
     views = system[system.numbers == MODULE].views((TILE, TILE))
     width, height, rows = 4 * (TILE + MARGIN) + MARGIN, TILE + TEXT + MARGIN, -(-len(volumes) // 2)
     page = Image.new("RGB", (2 * width, rows * height + MARGIN), (24, 26, 29))
@@ -94,7 +93,7 @@ def sheet(system: mph.PinholeSystem, volumes: dict[str, mph.Volume]) -> Image.Im
 
 
 def back_projections(system: mph.PinholeSystem) -> Image.Image:
-    """A row for ideal holes and one for the scanner's: truth, sum, product and minimum, each from 0 to its largest."""
+    """Draw truth, sum, product and minimum, each from 0 to its largest: a row for ideal holes, one for the scanner's."""
     views, size = system.views((128, 128)), 2 * TILE - MARGIN
     grid = mph.Grid.centered((84, 84, 42), 1.0)
     truth = PHANTOMS["Derenzo"].voxelize(mph.Grid.centered((168, 168, 84), 0.5))
@@ -116,7 +115,7 @@ def back_projections(system: mph.PinholeSystem) -> Image.Image:
 
 
 def events() -> Image.Image:
-    """Three events of the recipe that `mphdrr events new --like derenzo` writes, in voxels of half the size."""
+    """Draw three events of the recipe that `mphdrr events new --like derenzo` writes, in voxels of half the size."""
     recipe = mph.events.EventRecipe(template_text("derenzo").replace("spacing = 1.0", "spacing = 0.5"))
     with tempfile.TemporaryDirectory() as folder:
         made = mph.events.make(recipe, Path(folder, "derenzo"), 3)
@@ -125,7 +124,7 @@ def events() -> Image.Image:
 
 
 def telling(array: np.ndarray) -> list[int]:
-    """Along each axis the slice near the middle with the most contrast."""
+    """Return, along each axis, the index of the slice near the middle with the most contrast."""
     places = []
     for axis in range(3):
         n = array.shape[axis]
@@ -135,26 +134,26 @@ def telling(array: np.ndarray) -> list[int]:
 
 
 def framed(array: np.ndarray) -> tuple[np.ndarray, int]:
-    """Index at the middle of the filled voxels, and the side of a cube around it that contains them."""
+    """Return the index at the middle of the filled voxels, and the side of a cube around it that contains them."""
     filled = np.argwhere(array > 0.02 * array.max())
     low, high = filled.min(axis=0), filled.max(axis=0)
     return (low + high) // 2, int((high - low).max()) + 8
 
 
 def around(picture: np.ndarray, middle: np.ndarray, side: int) -> np.ndarray:
-    """The square of a picture around a pixel, 0 outside the picture."""
+    """Return the square of a picture around a pixel, 0 outside the picture."""
     first = middle + side - side // 2  # of the padded picture
     return np.pad(picture, side)[first[0] : first[0] + side, first[1] : first[1] + side]
 
 
 def colored(picture: np.ndarray, grey: bool) -> Image.Image:
-    """Values as colours, from 0 to nearly the largest."""
+    """Color values from 0 to nearly the largest."""
     window = 0.0, max(float(np.quantile(picture, 0.999)), 1e-12)
     return Image.fromarray(Display("grey" if grey else "inferno").colored(picture, window))
 
 
 def in_the_scanner(system: mph.PinholeSystem, folder: Path, ct: mph.Volume | None) -> None:
-    """A phantom, the sensitivity map, and the CT, between the modules; and the demo's pictures."""
+    """Draw a phantom, the sensitivity map, and the CT, between the modules; and the demo's pictures."""
     try:
         import bpy
     except ImportError:

@@ -71,6 +71,7 @@ spacing = 5.0                     # mm
 
 
 def main() -> None:
+    """Write the study's files, reconstruct it with and without each correction, and print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", nargs="?", default="measured_study", help="where the files are written")
     parser.add_argument("--picture", help="write slices of some volumes (.webp)")
@@ -127,7 +128,7 @@ def write_study(folder: Path, modules: int = 80, pixels: int = 32, seed: int = 1
 
 
 def pixels_of(shape: tuple[int, ...], rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The pixels' efficiencies, 0 where dead, and which are dead and which are hot (M, n_v, n_u).
+    """Draw the pixels' efficiencies, 0 where dead, and masks of the dead and of the hot ones (M, n_v, n_u).
 
     Crystals count less at the edges, and pixels differ by 4 %. Dead are one pixel in 200 and one module, hot one in 300.
     """
@@ -150,7 +151,7 @@ def counted(
     hot: np.ndarray,
     rng: np.random.Generator,
 ) -> list[np.ndarray]:
-    """Counts of the three windows: photons as they are and scattered ones, hot pixels' own, dead time, and noise.
+    """Draw the counts of the three windows: unscattered and scattered photons, hot pixels, dead time, and noise.
 
     The scattered ones are a continuum that falls linearly with the energy, of images smeared over a quarter of the crystal.
     """
@@ -169,14 +170,17 @@ def counted(
 
 
 def gaussian(count: int, fwhm: float) -> np.ndarray:
-    """A matrix that smears `count` pixels along an axis."""
+    """Return the matrix that smears `count` pixels along an axis."""
     apart = np.subtract.outer(np.arange(count), np.arange(count))
     weights = np.exp(-4 * np.log(2) * (apart / fwhm) ** 2)
     return weights / weights.sum(axis=0)
 
 
 def write_dicom(path: Path, windows: list[np.ndarray], times: np.ndarray, starts: np.ndarray) -> None:
-    """Frames of each energy window, module by module; modules that measure together are a phase (DICOM part 3, C.8.4)."""
+    """Write the frames of each energy window, module by module, as a DICOM file.
+
+    Modules that measure together are a phase (DICOM part 3, C.8.4).
+    """
     import pydicom.uid
     from pydicom.dataset import Dataset, FileMetaDataset
 
@@ -215,7 +219,7 @@ def write_dicom(path: Path, windows: list[np.ndarray], times: np.ndarray, starts
 
 
 def write_interfile(path: Path, windows: list[np.ndarray], times: np.ndarray, starts: np.ndarray) -> None:
-    """The same frames as a header and a file of numbers."""
+    """Write the frames of each energy window as an Interfile header and a file of numbers."""
     frames, count = np.concatenate(windows), len(windows)
     edges = WINDOWS if count == 3 else WINDOWS[1:2]
     lines = ["!INTERFILE :=", "!imaging modality := nucmed", f"!name of data file := {path.with_suffix('.img').name}"]
@@ -232,14 +236,14 @@ def write_interfile(path: Path, windows: list[np.ndarray], times: np.ndarray, st
 
 
 def stored(frames: np.ndarray) -> np.ndarray:
-    """Counts as numbers of two bytes."""
+    """Return the counts as unsigned 16-bit integers."""
     if frames.max() > 65535:
         raise ValueError(f"{frames.max()} counts in a pixel are more than two bytes hold")
     return frames.astype("<u2")
 
 
 def reconstructed(folder: Path) -> dict[str, mph.Volume]:
-    """Volumes by the names of the table's rows: without faults, by the recipe, and by it with a correction left out each."""
+    """Return volumes by the table's rows: without faults, by the recipe, and with each correction left out in turn."""
     recipe = mph.read_recipe(folder / "study.toml")
     find_efficiency(folder, recipe)
     found = {"without faults": reconstruct(recipe.updated(faultless(folder, recipe)))}
@@ -249,7 +253,7 @@ def reconstructed(folder: Path) -> dict[str, mph.Volume]:
 
 
 def find_efficiency(folder: Path, recipe: mph.Recipe) -> None:
-    """The efficiencies from the flood, as by `mphdrr project --counts flood.dcm` and `mphdrr counts flood`."""
+    """Compute the efficiencies from the flood, as `mphdrr project --counts flood.dcm` and `mphdrr counts flood` do."""
     bare = {key: None for key in recipe.given if not key.startswith(("system.", "model.kind", "counts.orientation"))}
     said = {"counts.files": [str(folder / "flood.dcm")], "counts.frames": frames_of(folder)}
     (flood,) = runs_of(recipe.updated(bare | said))
@@ -260,12 +264,12 @@ def find_efficiency(folder: Path, recipe: mph.Recipe) -> None:
 
 
 def frames_of(folder: Path) -> str:
-    """Which module each frame of a file with one energy window is of."""
+    """Return the module numbers of the frames of a file with one energy window."""
     return f"1-{len(mph.read_system(folder / 'scanner.xlsx'))}"
 
 
 def faultless(folder: Path, recipe: mph.Recipe) -> dict[str, Any]:
-    """What the recipe says otherwise of the study without faults."""
+    """Return the changes of the recipe for the study without faults."""
     plain = {key: None for key in recipe.given if key.startswith("counts.") and key != "counts.orientation"}
     plain |= dict.fromkeys(("model.efficiency", "model.dead_time", "model.start"))
     files, seconds = [str(folder / "faultless.npy")], float(np.load(folder / "truth.npz")["times"].mean())
@@ -273,7 +277,7 @@ def faultless(folder: Path, recipe: mph.Recipe) -> dict[str, Any]:
 
 
 def left_out(folder: Path, recipe: mph.Recipe) -> dict[str, dict[str, Any]]:
-    """What the recipe says otherwise, by rows: nothing, Interfile instead of DICOM, and without a correction each."""
+    """Return the changes of the recipe by rows: none, Interfile instead of DICOM, and without a correction each."""
     efficiency, levelled = (np.load(folder / f"{name}.npy") for name in ("efficiency", "levelled"))
     gone = np.zeros_like(efficiency) + ~efficiency.any((1, 2), keepdims=True)
     several = {
@@ -313,7 +317,7 @@ def left_out(folder: Path, recipe: mph.Recipe) -> dict[str, dict[str, Any]]:
 
 
 def runs_of(recipe: mph.Recipe) -> list[Any]:
-    """The recipe's runs; warnings, as of dead pixels in the flood, are what the study is about."""
+    """Return the recipe's runs without warnings, such as those of dead pixels, which the study is about."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", mph.InputWarning)
         return list(mph.run_recipe(recipe))
@@ -326,15 +330,17 @@ def reconstruct(recipe: mph.Recipe) -> mph.Volume:
 
 
 def middle(volume: mph.Volume) -> np.ndarray:
-    """The values within the ball in the middle."""
+    """Return the values within the ball in the middle."""
     axes = (np.arange(n) - (n - 1) / 2 for n in volume.grid.shape)
     squares = [(x * step) ** 2 for x, step in zip(axes, volume.grid.spacing, strict=True)]
     return volume.array[np.add.outer(np.add.outer(squares[0], squares[1]), squares[2]) < MIDDLE**2]
 
 
 def numbers_of(volumes: Mapping[str, mph.Volume]) -> dict[str, tuple[float, float, float, float]]:
-    """Of each row the middle's mean, and as shares its difference from that without faults, its standard deviation, and how
-    much its voxels differ from those with all corrections (root mean square).
+    """Return four numbers of each row, from the voxels in the middle.
+
+    The mean; and, relative to means: the difference from the volume without faults, the standard deviation, and the root
+    mean square difference from the volume with all corrections.
     """
     right, best = middle(volumes["without faults"]).mean(), middle(volumes[ALL])
     found = {}
@@ -346,7 +352,7 @@ def numbers_of(volumes: Mapping[str, mph.Volume]) -> dict[str, tuple[float, floa
 
 
 def print_table(volumes: Mapping[str, mph.Volume]) -> None:
-    """The middle, in Markdown."""
+    """Print the numbers of all rows in Markdown."""
     print("| | mean, kBq/mL | off by | standard deviation | voxels changed by |\n|---|---|---|---|---|")
     for name, (mean, off, deviation, other) in numbers_of(volumes).items():
         changed = "–" if name in ("without faults", ALL) else f"{other:.1%}"
@@ -354,7 +360,7 @@ def print_table(volumes: Mapping[str, mph.Volume]) -> None:
 
 
 def draw(volumes: Mapping[str, mph.Volume], path: str) -> None:
-    """Slices along the cylinder, in the same colors: without faults, with all corrections, and with one left out each."""
+    """Draw slices along the cylinder in the same colors: without faults, with all corrections, each correction left out."""
     from PIL import Image
 
     display, side, gap = Display(colors="inferno"), 200, 10

@@ -1,4 +1,7 @@
-"""Workbook, phantom, projections and their adjoint in Python, without Blender: python package.py [scanner.xlsx]"""
+"""Read a workbook, voxelize a phantom, and compute projections and their adjoint in Python, without Blender.
+
+python package.py [scanner.xlsx]
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""Load a batch of projections and volumes from a run, as a training script would: python read_run.py run.h5
+"""Load a batch of projections and volumes from a run, as a training script would.
+
+    python read_run.py run.h5
 
 A run is one HDF5 file; `h5py.File(path)["projections"][m]` reads only one view. ``mphdrr export run.h5 -o run.pt`` writes
 it as .pt, which loads with ``torch.load("run.pt", weights_only=True)``.
@@ -13,7 +15,7 @@ import numpy as np
 
 
 def load_batch(path: str, modules: np.ndarray) -> dict[str, np.ndarray]:
-    """Projections (B, 1, n_v, n_u), projection matrices (B, 3, 4) and the volume of the views `modules`."""
+    """Return projections (B, 1, n_v, n_u), projection matrices (B, 3, 4) and the volume of the views `modules`."""
     with h5py.File(path) as file:
         return {
             "projections": np.stack([file["projections"][m] for m in modules])[:, None],

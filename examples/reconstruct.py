@@ -21,6 +21,7 @@ WORKBOOK = Path(__file__).with_name("dc-spect-80.xlsx")
 
 
 def main() -> None:
+    """Simulate the scan, reconstruct it, print the scores and draw the result."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("workbook", nargs="?", default=WORKBOOK, help="the scanner's geometry workbook")
     parser.add_argument("--picture", default="reconstruction.png", help="file for slices, truth and objective")

@@ -26,6 +26,7 @@ SIDE = 512.0  # mm, the detector's
 
 
 def main() -> None:
+    """Make a radiograph, move the camera away and print how near the registration comes to the true pose."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("ct", help="NIfTI file of CT numbers")
     parser.add_argument("--degrees", type=float, default=10.0, help="rotation of the start about the CT's centre")

@@ -43,6 +43,7 @@ pose = {{ turn = "uniform" }}
 
 
 def main() -> None:
+    """Train on the given event set, or on a tiny one made for this purpose."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("set", nargs="?", help="folder of an event set with splits train and validation")
     parser.add_argument("--model", default="emission", help="of the recipe, whose counts are the network's input")
@@ -61,6 +62,7 @@ def main() -> None:
 
 
 def train(events: EventSet, arguments: argparse.Namespace) -> None:
+    """Train the network, and print the loss of training and validation after each epoch."""
     torch.manual_seed(0)
     device = "cuda" if torch.cuda.is_available() else "cpu"
     fields = (arguments.model, "truth")
@@ -79,7 +81,7 @@ def train(events: EventSet, arguments: argparse.Namespace) -> None:
     scale = float(first.truth.array.max())
 
     def prepared(batch: dict[str, torch.Tensor]) -> tuple[torch.Tensor, torch.Tensor]:
-        """Input and target (B, 1, n_x, n_y, n_z), both about 1."""
+        """Return input and target (B, 1, n_x, n_y, n_z), both about 1."""
         back = A.T(batch[arguments.model]) / sensitivity
         back = back / back.amax(dim=(1, 2, 3), keepdim=True).clamp(min=1e-12)
         return back[:, None].to(device), batch["truth"][:, None].to(device) / scale
@@ -108,6 +110,7 @@ def train(events: EventSet, arguments: argparse.Namespace) -> None:
 
 
 def small_network(channels: int = 16) -> torch.nn.Module:
+    """Return a network of four convolutions."""
     layers: list[torch.nn.Module] = [torch.nn.Conv3d(1, channels, 3, padding=1), torch.nn.ReLU()]
     for _ in range(2):
         layers += [torch.nn.Conv3d(channels, channels, 3, padding=1), torch.nn.ReLU()]

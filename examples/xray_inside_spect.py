@@ -27,7 +27,7 @@ SECONDS = 600.0  # of SPECT
 
 
 def main(folder: Path | None) -> None:
-    """Print what is found."""
+    """Run the study, and print its results."""
     warnings.simplefilter("ignore", mph.InputWarning)
     begun = time.monotonic()
     pinholes = mph.read_system(HERE / "dc-spect-80.xlsx")[::2]  # half of them, in half the time
@@ -43,7 +43,7 @@ def main(folder: Path | None) -> None:
     water = mph.SpectralTransmission(xray, mph.tube_spectrum(120).coarser(4), ("water",), ((20, 120),))
 
     def line_integrals(volume: mph.Volume, seed: int) -> np.ndarray:
-        """What the CT says of CT numbers: mu at 70 keV along each ray, were all of it water."""
+        """Return mu of water at 70 keV times the path through water that the CT derives from its counts, for each ray."""
         expected = counter.project(mph.water_and_bone(volume), mph.Projector(volume.grid, xray.views()), xray.mas)
         counts = mph.sample_counts(np.moveaxis(expected, 0, 1), seed)
         return mph.correct_beam_hardening(np.moveaxis(counts, 1, 0), water, xray.mas) * mph.attenuation("water", 70.0)
@@ -102,7 +102,7 @@ def main(folder: Path | None) -> None:
 
 
 def picture(path: Path, radiographs: np.ndarray, ct: mph.Volume, volumes: dict, spect: dict) -> None:
-    """A radiograph and slices through the heart: CT numbers, truth and found; SPECT; dose."""
+    """Draw a radiograph and slices through the heart: CT numbers, true and reconstructed; SPECT; dose."""
     from PIL import Image, ImageDraw
 
     from mphdrr.core.runs.display import Display

@@ -68,7 +68,7 @@ def main() -> None:
 
 
 def body(seed: int) -> mph.ShapePhantom:
-    """An ellipsoid of tissue with fat, air, muscle, iodine and bone in it; mu at 60 keV."""
+    """Return an ellipsoid of tissue that contains fat, air, muscle, iodine and bone; mu at 60 keV."""
     rng = np.random.default_rng(seed)
     shapes = [mph.Ellipsoid(radii=(62, 58, 54), mu=0.0206)]
     for mu in (0.0185, 0.0055, 0.0217, 0.03, 0.045, 0.0185, 0.0217, 0.0055):
@@ -78,7 +78,7 @@ def body(seed: int) -> mph.ShapePhantom:
 
 
 def measured(views: mph.Views, seed: int, dose: float) -> tuple[mph.Volume, np.ndarray]:
-    """The truth on the voxels of the reconstruction, and line integrals from voxels half as large, with noise."""
+    """Return the truth on the reconstruction's voxels, and line integrals from voxels half as large, with noise."""
     fine = body(seed).voxelize(FINE, quantity="mu")
     photons = dose * PHOTONS
     passed = photons * np.exp(-np.asarray(mph.Projector(FINE, views)(fine)))
@@ -89,7 +89,7 @@ def measured(views: mph.Views, seed: int, dose: float) -> tuple[mph.Volume, np.n
 def run(
     method: str, views: mph.Views, images: np.ndarray, strength: float | str | None, dose: float, iterations: int
 ) -> Found:
-    """The values after each number of iterations; 0 for FDK, which has none."""
+    """Reconstruct; return the values by number of iterations, which is 0 for FDK."""
     if method == "FDK":
         return {0: mph.fdk(images, views, GRID, str(strength)).array}
     A, found = mph.Projector(GRID, views), Found()
@@ -109,7 +109,7 @@ def run(
 
 
 def best(method: str, views: mph.Views, dose: float) -> tuple[float | str | None, int]:
-    """The strength and the number of iterations with the least mean error of two bodies."""
+    """Return the strength and the number of iterations with the least mean error of two bodies."""
     scores: dict[tuple[float | str | None, int], float] = {}
     for strength in STRENGTHS[method]:
         for seed in (100, 101):
@@ -120,7 +120,7 @@ def best(method: str, views: mph.Views, dose: float) -> tuple[float | str | None
 
 
 def error(values: np.ndarray, truth: mph.Volume) -> float:
-    """Within the ball."""
+    """Return the NRMSE within the ball."""
     return mph.nrmse(values, truth.array, INSIDE)
 
 
@@ -129,19 +129,19 @@ def _frequencies() -> np.ndarray:
 
 
 def _ring_of_frequencies() -> np.ndarray:
-    """Frequencies of details of 8 to 40 mm."""
+    """Return the mask of the frequencies of details of 8 to 40 mm."""
     size = np.linalg.norm(_frequencies(), axis=-1)
     return (size > 1 / 40) & (size < 1 / 8)
 
 
 def seen_directions(system: mph.XraySystem) -> np.ndarray:
-    """For each frequency, whether the plane across it through the isocentre meets the arc of sources (Tuy's condition)."""
+    """Return the mask of frequencies whose plane through the isocentre meets the arc of sources (Tuy's condition)."""
     sides = _frequencies() @ (system.sources / np.linalg.norm(system.sources, axis=1)[:, None]).T
     return (sides.min(axis=-1) <= 0) & (sides.max(axis=-1) >= 0)
 
 
 def errors_by_direction(values: np.ndarray, truth: mph.Volume, seen: np.ndarray) -> list[float]:
-    """Errors of details of 8 to 40 mm whose direction the sources see, and of those that they do not."""
+    """Return the errors of details of 8 to 40 mm in directions that the sources see, and in the others."""
     inside = np.clip((ROI - DISTANCE) / 10, 0, 1)
     wanted, wrong = (np.abs(np.fft.fftn(inside * x)) for x in (truth.array, values - truth.array))
     parts = (_ring_of_frequencies() & which for which in (seen, ~seen))
@@ -149,7 +149,7 @@ def errors_by_direction(values: np.ndarray, truth: mph.Volume, seen: np.ndarray)
 
 
 def misaligned(system: mph.XraySystem, bodies: int) -> None:
-    """Panels that are 1 mm beside where they should be: the same images with the true matrices and with the drawn ones."""
+    """Print the errors for panels displaced by 1 mm, reconstructed with the true matrices and with the nominal ones."""
     angle = np.random.default_rng(5).uniform(0, 2 * np.pi, len(system))[:, None]
     u, v = (x / np.linalg.norm(x, axis=1)[:, None] for x in (system.panel_u, system.panel_v))
     true = system.replace(panel_centers=system.panel_centers + np.cos(angle) * u + np.sin(angle) * v)
@@ -169,7 +169,7 @@ def misaligned(system: mph.XraySystem, bodies: int) -> None:
 
 
 def picture(shown: list[np.ndarray], path: str, height: int = 240) -> None:
-    """Slices across z and across x: the truth, then each method from the arc and from the ring."""
+    """Draw slices across z and across x: the truth, then each method from the arc and from the ring."""
     from PIL import Image
 
     truth, *others = shown

@@ -73,7 +73,7 @@ ADD_KINDS = tuple(
 
 
 class MPHDRR_OT_import_phantom(PhantomSettings, AddPhantom, bpy.types.Operator):
-    """Add the phantom that a TOML file describes as a volume; its text is kept in the .blend"""
+    """Add the phantom that a TOML file describes as a volume; its text is kept in the .blend."""
 
     __annotations__ = {
         "filepath": file_properties.file_property("Phantom to read"),

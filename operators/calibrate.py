@@ -10,7 +10,7 @@ from ..addon.scanner import selection
 
 class MPHDRR_OT_calibrate(jobs.JobOperator, bpy.types.Operator):
     """Fit the positions of the scanner's modules to images of point sources by a calibration recipe (.toml); arrows lead
-    from nominal to fitted pinholes
+    from nominal to fitted pinholes.
     """
 
     poll = reports.needs(selection.SCANNER)

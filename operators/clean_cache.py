@@ -7,7 +7,7 @@ from ..addon.blender.reports import Reported, needs
 
 
 class MPHDRR_OT_clean_cache(Reported, bpy.types.Operator):
-    """Delete compiled code; it is made again when it is needed"""
+    """Delete compiled code; it is made again when it is needed."""
 
     bl_options = {"INTERNAL"}
 

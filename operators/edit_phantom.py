@@ -18,11 +18,11 @@ class _EditPhantom(jobs.JobOperator):
 
 
 class MPHDRR_OT_update_phantom(_EditPhantom, bpy.types.Operator):
-    """Make the active phantom's voxels again from its settings; its place stays"""
+    """Make the active phantom's voxels again from its settings; its place stays."""
 
 
 class MPHDRR_OT_apply_phantom_pose(_EditPhantom, bpy.types.Operator):
-    """Make the active phantom's voxels again on a grid along the world's axes; its settings are given up"""
+    """Make the active phantom's voxels again on a grid along the world's axes; its settings are given up."""
 
     bl_label = "Apply Pose"
 
@@ -30,7 +30,7 @@ class MPHDRR_OT_apply_phantom_pose(_EditPhantom, bpy.types.Operator):
 
 
 class MPHDRR_OT_show_phantom_outline(reports.Reported, bpy.types.Operator):
-    """Show or hide the surfaces of the active phantom's shapes as wires that go with it"""
+    """Show or hide the surfaces of the active phantom's shapes as wires that go with it."""
 
     bl_label = "Outline"
 

@@ -12,7 +12,7 @@ from ..core.xray.dose import decays
 
 
 class MPHDRR_OT_add_slices(Reported, bpy.types.Operator):
-    """Show an axial, a coronal and a sagittal slice of the active volume as planes that go with it"""
+    """Show an axial, a coronal and a sagittal slice of the active volume as planes that go with it."""
 
     place: FloatVectorProperty(
         name="Place", description="Point where the slices meet, as shares of the grid's axes", size=3, min=0.0,
@@ -28,7 +28,7 @@ class MPHDRR_OT_add_slices(Reported, bpy.types.Operator):
 
 
 class MPHDRR_OT_remove_slices(Reported, bpy.types.Operator):
-    """Remove the active volume's slice planes"""
+    """Remove the active volume's slice planes."""
 
     poll = needs(volumes.ACTIVE)
 
@@ -47,7 +47,7 @@ def _is_ct(context: bpy.types.Context) -> bool:
 
 
 class MPHDRR_OT_ct_to_attenuation(jobs.JobOperator, bpy.types.Operator):
-    """Make a volume of attenuation coefficients (1/mm) from the active volume of CT numbers; the CT stays"""
+    """Make a volume of attenuation coefficients (1/mm) from the active volume of CT numbers; the CT stays."""
 
     bl_label = "CT to Attenuation"
     dialog = {"confirm_text": "Convert"}
@@ -63,7 +63,7 @@ class MPHDRR_OT_ct_to_attenuation(jobs.JobOperator, bpy.types.Operator):
 
 
 class MPHDRR_OT_add_dose_map(jobs.JobOperator, bpy.types.Operator):
-    """Make a volume of the absorbed dose rate (mGy/h) from the active volume of activity, as in water of density 1"""
+    """Make a volume of the absorbed dose rate (mGy/h) from the active volume of activity, as in water of density 1."""
 
     isotope: EnumProperty(
         name="Isotope",
@@ -79,7 +79,7 @@ class MPHDRR_OT_add_dose_map(jobs.JobOperator, bpy.types.Operator):
 
 
 class MPHDRR_OT_clean_volume_files(Reported, bpy.types.Operator):
-    """Remove the files of voxels and runs in this .blend's folder that no volume and no list of runs needs any more"""
+    """Remove the files of voxels and runs in this .blend's folder that no volume and no list of runs needs any more."""
 
     bl_label = "Clean Up Volume Files"
     bl_options = {"REGISTER"}
@@ -97,7 +97,7 @@ class MPHDRR_OT_clean_volume_files(Reported, bpy.types.Operator):
 
 class MPHDRR_OT_collect_files(Reported, bpy.types.Operator):
     """Copy every outside file that the scene uses, such as its workbook, into the folder beside the .blend, so that both can
-    be moved together. Missing files are reported
+    be moved together. Missing files are reported.
     """
 
     poll = needs((lambda context: bpy.data.filepath, "Save the .blend first: its folder is beside it"))
@@ -108,7 +108,7 @@ class MPHDRR_OT_collect_files(Reported, bpy.types.Operator):
 
 class MPHDRR_OT_add_looks(Reported, bpy.types.Operator):
     """Put the looks of volumes into the Asset Browser, as a library of their own: dragged onto a volume, a look replaces its
-    colours, also on its slices, and the display range stays
+    colours, also on its slices, and the display range stays.
     """
 
     bl_label = "Looks for Asset Browser"
@@ -131,7 +131,7 @@ class MPHDRR_OT_add_looks(Reported, bpy.types.Operator):
 
 
 class MPHDRR_OT_remake_volumes(jobs.JobOperator, bpy.types.Operator):
-    """Make the phantoms and maps again whose files of voxels are missing, as after a crash; they stay where they are"""
+    """Make the phantoms and maps again whose files of voxels are missing, as after a crash; they stay where they are."""
 
     bl_label = "Make Missing Volumes Again"
 
@@ -144,7 +144,7 @@ class MPHDRR_OT_remake_volumes(jobs.JobOperator, bpy.types.Operator):
 
 
 class MPHDRR_OT_find_volume_files(Reported, bpy.types.Operator):
-    """Look for the missing files of voxels, by their names, in a folder and all below it"""
+    """Look for the missing files of voxels, by their names, in a folder and all below it."""
 
     bl_label = "Find Missing Volume Files"
 

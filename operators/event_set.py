@@ -11,7 +11,7 @@ from ..core.events.templates import TEMPLATES
 
 class MPHDRR_OT_new_event_recipe(reports.Reported, ExportHelper, bpy.types.Operator):
     """Write a recipe for events with comments in it, to be edited and tried. Its scanner is the scene's workbook, or the
-    example if there is none
+    example if there is none.
     """
 
     filename_ext = ".toml"
@@ -27,7 +27,7 @@ class MPHDRR_OT_new_event_recipe(reports.Reported, ExportHelper, bpy.types.Opera
 
 class MPHDRR_OT_try_event(jobs.JobOperator, bpy.types.Operator):
     """Put the recipe's next event on the phantom in the scene: its kind, settings and pose. Makes a phantom if there is
-    none. The number goes up by one; the same number is always the same phantom
+    none. The number goes up by one; the same number is always the same phantom.
     """
 
     bl_label = "Another Phantom of the Recipe"
@@ -44,7 +44,7 @@ class MPHDRR_OT_try_event(jobs.JobOperator, bpy.types.Operator):
 
 class MPHDRR_OT_make_event_set(jobs.JobOperator, bpy.types.Operator):
     """Make the recipe's events that a folder does not have yet. If it is cancelled, the finished events stay, and the next
-    run continues from there
+    run continues from there.
     """
 
     recipe: event_properties.RECIPE
@@ -57,7 +57,7 @@ class MPHDRR_OT_make_event_set(jobs.JobOperator, bpy.types.Operator):
 
 class MPHDRR_OT_open_event(jobs.JobOperator, bpy.types.Operator):
     """Open an event of a set in the scene, in place of the one opened before: its truth as a volume, its phantom with its
-    pose and settings, hidden, and its projections as a run
+    pose and settings, hidden, and its projections as a run.
     """
 
     folder: event_properties.FOLDER

@@ -13,7 +13,7 @@ _FORMATS = tuple((f.name, f.name, f.title, FORMAT_NUMBERS[f.name]) for f in FORM
 
 
 class MPHDRR_OT_export_geometry(jobs.ExportJob, bpy.types.Operator):
-    """Write the scanner as it stands in the scene to a workbook, into a copy of the one it came from"""
+    """Write the scanner as it stands in the scene to a workbook, into a copy of the one it came from."""
 
     bl_label = "Export Pinhole Geometry"
     bl_options = {"REGISTER", "UNDO"}  # with Undo, because the new workbook becomes the scanner's
@@ -45,7 +45,7 @@ class MPHDRR_OT_export_geometry(jobs.ExportJob, bpy.types.Operator):
 
 class MPHDRR_OT_export_for_program(jobs.ExportJob, bpy.types.Operator):
     """Write the scanner as it stands in the scene for another program: cameras for reconstruction codes, solids to print,
-    Monte Carlo simulations. Images are those of the Projections panel
+    Monte Carlo simulations. Images are those of the Projections panel.
     """
 
     bl_label = "Export Geometry for a Program"

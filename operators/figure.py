@@ -61,19 +61,19 @@ class FigureOperator(jobs.ExportJob):
 
 
 class MPHDRR_OT_export_figure(FigureOperator, bpy.types.Operator):
-    """Draw a figure of the scanner, the volume or the last projections as PNG, or as SVG whose labels are text"""
+    """Draw a figure of the scanner, the volume or the last projections as PNG, or as SVG whose labels are text."""
 
     figure: EnumProperty(name="Figure", description="Kind of the figure", items=figures.kind_items(), default="SCANNER")
 
 
 class MPHDRR_OT_render_picture(FigureOperator, bpy.types.Operator):
-    """Render the volume in the scanner for a paper, with scale, colour bar and rays of the selected modules or a ring"""
+    """Render the volume in the scanner for a paper, with scale, colour bar and rays of the selected modules or a ring."""
 
     figure = "PICTURE"
 
 
 class MPHDRR_OT_render_animation(FigureOperator, bpy.types.Operator):
-    """Render pictures and an MP4 of the volume in the scanner: once around it, or one module lit after the other"""
+    """Render pictures and an MP4 of the volume in the scanner: once around it, or one module lit after the other."""
 
     endings = FILMS
     figure: EnumProperty(

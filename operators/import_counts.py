@@ -22,7 +22,7 @@ _PROPERTIES = {
 
 class MPHDRR_OT_import_counts(jobs.JobOperator, bpy.types.Operator):
     """Read measured counts, a frame for each module of the scanner, as projections. The order and orientation of the frames
-    are never guessed: set them, and check the mosaic
+    are never guessed: set them, and check the mosaic.
     """
 
     bl_label = "Import Measured Counts"

@@ -32,7 +32,7 @@ def draw_losses(layout: bpy.types.UILayout, losses: Iterable[str]) -> None:
 
 
 class MPHDRR_OT_import_geometry(bpy.types.Operator):
-    """Read a workbook of pinhole modules and build the scanner: a camera, a collimator and a crystal each"""
+    """Read a workbook of pinhole modules and build the scanner: a camera, a collimator and a crystal each."""
 
     bl_label = "Import Pinhole Geometry"
     bl_options = {"REGISTER", "UNDO"}
@@ -126,7 +126,9 @@ class MPHDRR_OT_import_geometry(bpy.types.Operator):
         context.view_layer.update()  # so that scripts find the children's matrix_world in place
         self._dialog = ""
         column_maps.clear(context.window_manager.mphdrr_columns)
-        further_modules = "".join(f" and {len(each)} of the kind {each.kind}" for each in self._further_scanners)
+        further_modules = "".join(
+            f" and {len(scanner)} of the kind {scanner.kind}" for scanner in self._further_scanners
+        )
         return f"Imported {len(system)} modules{further_modules} into '{collection.name}'"
 
     def cancel(self, context: bpy.types.Context) -> None:

@@ -78,7 +78,7 @@ class ReadVolumes(jobs.JobOperator):
 
 
 class MPHDRR_OT_import_volume(ReadVolumes, bpy.types.Operator):
-    """Read a CT, an image or an OpenVDB grid as a volume to project; for a DICOM series choose the folder"""
+    """Read a CT, an image or an OpenVDB grid as a volume to project; for a DICOM series choose the folder."""
 
     asks_for = "filepath"
 
@@ -92,7 +92,7 @@ class MPHDRR_OT_import_volume(ReadVolumes, bpy.types.Operator):
 
 
 class MPHDRR_OT_import_volume_sequence(ReadVolumes, bpy.types.Operator):
-    """Read several files, in the order of their numbers, as one volume that plays over the frames"""
+    """Read several files, in the order of their numbers, as one volume that plays over the frames."""
 
     asks_for = "files"
 

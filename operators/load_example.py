@@ -14,7 +14,7 @@ from .import_geometry import ask_to_replace, draw_losses
 
 
 class MPHDRR_OT_load_example(jobs.JobOperator, bpy.types.Operator):
-    """Load the bundled scanner of 80 modules with a phantom, and show what every module, or every X-ray tube, sees of it"""
+    """Load the bundled scanner of 80 modules with a phantom, and show what every module, or every X-ray tube, sees of it."""
 
     example: EnumProperty(
         name="Example", description="Example to load", items=choices.items({}, example.EXAMPLES), options={"SKIP_SAVE"}
@@ -38,7 +38,7 @@ class MPHDRR_OT_load_example(jobs.JobOperator, bpy.types.Operator):
 
 
 class MPHDRR_OT_browse_example(Reported, bpy.types.Operator):
-    """Choose the bundled workbook, a scanner of 80 modules in 4 rings"""
+    """Choose the bundled workbook, a scanner of 80 modules in 4 rings."""
 
     bl_label = "Example Workbook"
     bl_options = {"INTERNAL"}

@@ -11,7 +11,7 @@ from ..addon.scanner.scanner_parts import modules_text
 
 
 class MPHDRR_OT_show_modules(selection.OnScanner, bpy.types.Operator):
-    """Show or hide modules with their collimators and crystals, in the viewport and in renders"""
+    """Show or hide modules with their collimators and crystals, in the viewport and in renders."""
 
     first: IntProperty(name="First", description="First module number of the range", default=1)
     last: IntProperty(name="Last", description="Last module number of the range", default=1)
@@ -32,7 +32,7 @@ class MPHDRR_OT_show_modules(selection.OnScanner, bpy.types.Operator):
 
 
 class MPHDRR_OT_isolate_ring(selection.OnModules, bpy.types.Operator):
-    """Show only the modules of the active module's ring; if only they are shown, show all"""
+    """Show only the modules of the active module's ring; if only they are shown, show all."""
 
     def change(self, context: bpy.types.Context, collection: bpy.types.Collection) -> str:
         cameras, ring = scanner.modules(collection), selection.selected_modules(context)[0].mphdrr_module.ring
@@ -44,7 +44,7 @@ class MPHDRR_OT_isolate_ring(selection.OnModules, bpy.types.Operator):
 
 
 class MPHDRR_OT_look_through_module(selection.OnScanner, bpy.types.Operator):
-    """Make the module's pinhole camera the scene's camera, and look through it"""
+    """Make the module's pinhole camera the scene's camera, and look through it."""
 
     number: IntProperty(name="Number", description="Module number", default=1)
 
@@ -60,7 +60,7 @@ class MPHDRR_OT_look_through_module(selection.OnScanner, bpy.types.Operator):
 
 
 class MPHDRR_OT_aim_modules(selection.OnScanner, bpy.types.Operator):
-    """Turn every module that does not look at the isocentre, without moving it"""
+    """Turn every module that does not look at the isocentre, without moving it."""
 
     bl_label = "Aim at Isocentre"
 
@@ -70,7 +70,7 @@ class MPHDRR_OT_aim_modules(selection.OnScanner, bpy.types.Operator):
 
 
 class MPHDRR_OT_duplicate_modules(selection.OnModules, bpy.types.Operator):
-    """Copy the selected modules, with collimators and crystals, to further places on their rings"""
+    """Copy the selected modules, with collimators and crystals, to further places on their rings."""
 
     bl_label = "Duplicate Along Ring"
 
@@ -93,7 +93,7 @@ class MPHDRR_OT_duplicate_modules(selection.OnModules, bpy.types.Operator):
 
 
 class MPHDRR_OT_remove_modules(selection.OnModules, bpy.types.Operator):
-    """Delete the selected modules with their collimators and crystals"""
+    """Delete the selected modules with their collimators and crystals."""
 
     def change(self, context: bpy.types.Context, collection: bpy.types.Collection) -> str:
         modules = selection.selected_modules(context)
@@ -104,7 +104,7 @@ class MPHDRR_OT_remove_modules(selection.OnModules, bpy.types.Operator):
 
 class MPHDRR_OT_tidy_modules(selection.OnScanner, bpy.types.Operator):
     """Make modules of copied cameras, with numbers, collimators and crystals of their own, and remove collimators and
-    crystals whose camera was deleted
+    crystals whose camera was deleted.
     """
 
     def change(self, context: bpy.types.Context, collection: bpy.types.Collection) -> str:
@@ -116,7 +116,7 @@ class MPHDRR_OT_tidy_modules(selection.OnScanner, bpy.types.Operator):
 
 
 class MPHDRR_OT_renumber_modules(selection.OnScanner, bpy.types.Operator):
-    """Number all modules 1, 2, ...; they are listed, projected and exported in that order from now on"""
+    """Number all modules 1, 2, ...; they are listed, projected and exported in that order from now on."""
 
     order: EnumProperty(
         name="Order",
@@ -133,7 +133,7 @@ class MPHDRR_OT_renumber_modules(selection.OnScanner, bpy.types.Operator):
 
 
 class MPHDRR_OT_reset_cameras(selection.OnScanner, bpy.types.Operator):
-    """Set lens and sensor of the modules' cameras to what the projections show"""
+    """Set lens and sensor of the modules' cameras to what the projections show."""
 
     def change(self, context: bpy.types.Context, collection: bpy.types.Collection) -> str:
         reset = following.reset_views(collection)
@@ -141,7 +141,7 @@ class MPHDRR_OT_reset_cameras(selection.OnScanner, bpy.types.Operator):
 
 
 class MPHDRR_OT_set_up_scene(selection.OnScanner, bpy.types.Operator):
-    """Set the scene's units to millimetres, and look at the whole scanner: for a scanner from another file"""
+    """Set the scene's units to millimetres, and look at the whole scanner: for a scanner from another file."""
 
     def change(self, context: bpy.types.Context, collection: bpy.types.Collection) -> str:
         scanner.set_up_scene(context.scene, collection)
@@ -149,7 +149,7 @@ class MPHDRR_OT_set_up_scene(selection.OnScanner, bpy.types.Operator):
 
 
 class MPHDRR_OT_remove_scanner(selection.OnScanner, bpy.types.Operator):
-    """Remove the scanner with its cameras, collimators, crystals and projections in the scene; your own objects stay"""
+    """Remove the scanner with its cameras, collimators, crystals and projections in the scene; your own objects stay."""
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
         collection = scanner.required_scanner(context.scene)
@@ -165,7 +165,7 @@ class MPHDRR_OT_remove_scanner(selection.OnScanner, bpy.types.Operator):
 
 class MPHDRR_OT_check_geometry(selection.OnScanner, bpy.types.Operator):
     """Look for collimators and crystals that overlap, holes that another module blocks, and modules that do not see
-    their ROI; select the modules concerned
+    their ROI; select the modules concerned.
     """
 
     def change(self, context: bpy.types.Context, collection: bpy.types.Collection) -> str:
@@ -179,7 +179,7 @@ class MPHDRR_OT_check_geometry(selection.OnScanner, bpy.types.Operator):
 
 class MPHDRR_OT_add_map(jobs.JobOperator, bpy.types.Operator):
     """Calculate a quantity of the scanner, with ideal modules, in every voxel around the isocentre, and show it as a volume,
-    in place of the scanner's last map of this quantity
+    in place of the scanner's last map of this quantity.
     """
 
     poll = reports.needs(selection.SCANNER)

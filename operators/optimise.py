@@ -8,7 +8,7 @@ from ..addon.scanner import optimising
 
 class MPHDRR_OT_optimise(jobs.JobOperator, bpy.types.Operator):
     """Optimise a scanner by a design recipe (.toml). It moves in the scene meanwhile: the active scanner if it has as many
-    modules as the recipe's, else a new one. Cancel restores it, Finish Now keeps the best so far
+    modules as the recipe's, else a new one. Cancel restores it, Finish Now keeps the best so far.
     """
 
     bl_label = "Optimise Scanner"

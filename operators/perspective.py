@@ -17,7 +17,7 @@ class _PerspectiveOperator(perspective_properties.PerspectiveSettings, jobs.JobO
 class MPHDRR_OT_show_in_perspective(_PerspectiveOperator, bpy.types.Operator):
     """Show the active volume in the active module's own coordinates, column, row and magnification k: a frustum of pictures,
     each the volume's mean along the pixels' rays in its layer. Seen from the pinhole they cover each other. The frustum
-    moves with the module; the settings are the panel's, unless a script gives others
+    moves with the module; the settings are the panel's, unless a script gives others.
     """
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
@@ -28,7 +28,7 @@ class MPHDRR_OT_show_in_perspective(_PerspectiveOperator, bpy.types.Operator):
 
 class MPHDRR_OT_resample_in_perspective(_PerspectiveOperator, bpy.types.Operator):
     """Resample the active volume to the active module's cells, one for each pixel and layer of depth, and back to its own
-    voxels, as a new volume, which shows the detail that these cells keep. Outside the module's field of view it is empty
+    voxels, as a new volume, which shows the detail that these cells keep. Outside the module's field of view it is empty.
     """
 
     bl_label = "Volume Through Module"
@@ -40,7 +40,7 @@ class MPHDRR_OT_resample_in_perspective(_PerspectiveOperator, bpy.types.Operator
 
 
 class MPHDRR_OT_clear_perspective(reports.Reported, bpy.types.Operator):
-    """Remove all volumes in perspective, of all modules"""
+    """Remove all volumes in perspective, of all modules."""
 
     poll = reports.needs((lambda context: frustums.frustums(context.scene), "No volume is shown in perspective"))
 

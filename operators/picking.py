@@ -17,7 +17,7 @@ _INDEX = "Index of the pixel as in the arrays; 0: the centre of pixel 0"
 
 class MPHDRR_OT_pick_pixel(eyedropper.Eyedropper, reports.Reported, bpy.types.Operator):
     """Click on a pixel of a projection, in the Image Editor or on a plane in the scene, to draw its ray, and its epipolar
-    lines on the other modules' projections. Esc or a right click changes nothing
+    lines on the other modules' projections. Esc or a right click changes nothing.
     """
 
     module: IntProperty(name="Module", description="Number of the module", default=1, options={"SKIP_SAVE"})
@@ -77,7 +77,7 @@ class MPHDRR_OT_pick_pixel(eyedropper.Eyedropper, reports.Reported, bpy.types.Op
 
 
 class MPHDRR_OT_clear_pixel(reports.Reported, bpy.types.Operator):
-    """Remove the picked pixel's ray and epipolar lines"""
+    """Remove the picked pixel's ray and epipolar lines."""
 
     bl_label = "Clear Picked Pixel"
 
@@ -94,7 +94,7 @@ def _has_image_editor(context: bpy.types.Context) -> bool:
 
 class MPHDRR_OT_pick_window(eyedropper.Eyedropper, bpy.types.Operator):
     """Click on a picture of the projections to make the exact number there the window's low or high end. The status bar
-    shows the number under the mouse; Esc or a right click changes nothing
+    shows the number under the mouse; Esc or a right click changes nothing.
     """
 
     bl_options = {"REGISTER", "UNDO"}
@@ -147,7 +147,7 @@ def _shows_mosaic(context: bpy.types.Context) -> bool:
 
 
 class MPHDRR_OT_pick_module(bpy.types.Operator):
-    """Make the module of the clicked image in the mosaic active"""
+    """Make the module of the clicked image in the mosaic active."""
 
     bl_options = {"UNDO", "INTERNAL"}
 

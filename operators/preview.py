@@ -9,7 +9,7 @@ from ..addon.volumes import volumes
 
 
 class MPHDRR_OT_live_preview(bpy.types.Operator):
-    """Show in the 3D views what the active module sees, updated when it, the phantom or a number changes; again: stop"""
+    """Show in the 3D views what the active module sees, updated when it, the phantom or a number changes; again: stop."""
 
     _can_start = reports.needs(
         (lambda context: not bpy.app.background, "Needs a window"),

@@ -15,7 +15,7 @@ _RUN: Need = (lambda context: runs.shown_run(context.scene) is not None, "No run
 
 class MPHDRR_OT_reconstruct(reconstruction_properties.ReconstructionSettings, jobs.JobOperator, bpy.types.Operator):
     """Reconstruct the volume of the shown run's projections. It is in the scene from its first iterations on, the truth is
-    hidden; Cancel asks whether to keep what there is. The settings are the panel's, unless a script gives others
+    hidden; Cancel asks whether to keep what there is. The settings are the panel's, unless a script gives others.
     """
 
     bl_label = "Reconstruct Projections"
@@ -39,7 +39,7 @@ class MPHDRR_OT_reconstruct(reconstruction_properties.ReconstructionSettings, jo
 
 
 class MPHDRR_OT_continue_reconstruction(jobs.JobOperator, bpy.types.Operator):
-    """Do ten more iterations of the last reconstruction, of the same run with the same settings, in the same volume"""
+    """Do ten more iterations of the last reconstruction, of the same run with the same settings, in the same volume."""
 
     poll = needs(_DONE, (reconstructions.resume_path, _NOTHING))
 
@@ -50,7 +50,7 @@ class MPHDRR_OT_continue_reconstruction(jobs.JobOperator, bpy.types.Operator):
 class MPHDRR_OT_backproject(reconstruction_properties.BackprojectionSettings, jobs.JobOperator, bpy.types.Operator):
     """Combine the shown run's projections along their rays in each voxel of a volume. It is no reconstruction: a value is
     that of whole rays, not of the voxel. Voxels are those of a reconstruction, with the panel's settings, unless a script
-    gives others
+    gives others.
     """
 
     bl_label = "Back-Project Projections"
@@ -66,7 +66,7 @@ class MPHDRR_OT_backproject(reconstruction_properties.BackprojectionSettings, jo
 
 class MPHDRR_OT_show_reconstruction(ShowPicture, bpy.types.Operator):
     """Show slices of the last reconstruction, beside the truth, in an Image Editor, opened below the 3D view if there is
-    none
+    none.
     """
 
     bl_label = "Show Slices of Reconstructed Volume"

@@ -13,13 +13,13 @@ from ..addon.pictures import images
 from ..addon.runs import projection_properties, rendering, runs
 from ..addon.scanner import scanner
 from ..core.errors import InputError
-from ..core.runs.formats import FORMATS
+from ..core.runs import FORMATS
 from ..core.runs.presets import PRESETS
 
 
 class MPHDRR_OT_render_projections(projection_properties.ProjectionSettings, jobs.JobOperator, bpy.types.Operator):
     """Project the volume into every module: exact line integrals or SPECT counts, stored as images and as a file beside
-    the .blend. The settings are the panel's, unless a script gives others
+    the .blend. The settings are the panel's, unless a script gives others.
     """
 
     volume: StringProperty(name="Volume", description="Name of the volume object to project", options={"SKIP_SAVE"})
@@ -56,7 +56,7 @@ class MPHDRR_OT_render_projections(projection_properties.ProjectionSettings, job
 
 class MPHDRR_OT_use_preset(reports.Reported, bpy.types.Operator):
     """Count photons, with isotope, aperture and crystal chosen together; time, noise, attenuation and the detector's
-    intrinsic blur stay as they are
+    intrinsic blur stay as they are.
     """
 
     bl_label = "Physics Preset"
@@ -73,7 +73,7 @@ class MPHDRR_OT_use_preset(reports.Reported, bpy.types.Operator):
 
 class MPHDRR_OT_load_recipe(reports.Reported, ImportHelper, bpy.types.Operator):
     """Set the panel to the settings of a recipe (.toml) or a run (.h5, .npz, .pt): model, detector, noise, modules and, if
-    the scene has objects of their names, volumes. By default the recipe of the last run
+    the scene has objects of their names, volumes. By default the recipe of the last run.
     """
 
     filter_glob: file_properties.shown_files((".toml", *FORMATS))
@@ -98,13 +98,13 @@ class ShowPicture(reports.Reported):
 
 
 class MPHDRR_OT_show_projections(ShowPicture, bpy.types.Operator):
-    """Show the mosaic of the last run in an Image Editor, opened below the 3D view if there is none"""
+    """Show the mosaic of the last run in an Image Editor, opened below the 3D view if there is none."""
 
     poll = reports.needs(images.PROJECTED)
 
 
 class MPHDRR_OT_export_dataset(jobs.ExportJob, bpy.types.Operator):
-    """Write the shown run, with geometry, volume and provenance, as HDF5 (.h5), NumPy (.npz) or PyTorch (.pt)"""
+    """Write the shown run, with geometry, volume and provenance, as HDF5 (.h5), NumPy (.npz) or PyTorch (.pt)."""
 
     bl_label = "Export mphDRR Dataset"
 

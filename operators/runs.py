@@ -28,7 +28,7 @@ _LISTED: Need = (lambda context: context.scene.mphdrr_projections.runs, "No runs
 
 
 class MPHDRR_OT_show_run(jobs.JobOperator, bpy.types.Operator):
-    """Show a run of the list: its images, the mosaic and the planes in the scene. Modules and volumes stay as they are"""
+    """Show a run of the list: its images, the mosaic and the planes in the scene. Modules and volumes stay as they are."""
 
     bl_options = {"REGISTER", "UNDO", "INTERNAL"}  # internal, because it is called by a click in the list
 
@@ -42,7 +42,7 @@ class MPHDRR_OT_show_run(jobs.JobOperator, bpy.types.Operator):
 
 
 class MPHDRR_OT_remove_run(Reported, bpy.types.Operator):
-    """Remove a run from the list, and its file from the disk if it is in this .blend's own folder"""
+    """Remove a run from the list, and its file from the disk if it is in this .blend's own folder."""
 
     poll = needs(_LISTED)
 
@@ -68,7 +68,7 @@ def _other_runs(self: Any, context: bpy.types.Context | None) -> list[tuple[str,
 
 class MPHDRR_OT_flood_efficiency(jobs.ExportJob, bpy.types.Operator):
     """Calculate the efficiencies of pixels, and find dead and hot ones, from the shown run of an even source (import the
-    flood as measured counts first). They are written to a file, which Efficiency under Physics then names
+    flood as measured counts first). They are written to a file, which Efficiency under Physics then names.
     """
 
     bl_label = "Efficiencies from Flood"
@@ -98,7 +98,7 @@ class MPHDRR_OT_flood_efficiency(jobs.ExportJob, bpy.types.Operator):
 
 class MPHDRR_OT_compare_runs(jobs.JobOperator, bpy.types.Operator):
     """Draw the shown run minus another one, of the same modules, pixels and unit, as a mosaic: white where they are equal,
-    red where the shown one has more, blue where it has less
+    red where the shown one has more, blue where it has less.
     """
 
     poll = needs(_LISTED)

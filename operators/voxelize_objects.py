@@ -10,7 +10,7 @@ from ..addon.volumes import meshes, volumes
 
 class MPHDRR_OT_voxelize_objects(jobs.JobOperator, bpy.types.Operator):
     """Make a volume of the selected closed meshes, modifiers included: a voxel gets the value times the share that they
-    cover. An object's custom property 'activity' or 'mu' replaces the value; later names cover earlier ones
+    cover. An object's custom property 'activity' or 'mu' replaces the value; later names cover earlier ones.
     """
 
     bl_label = "Voxelize Meshes"
@@ -39,7 +39,7 @@ class MPHDRR_OT_voxelize_objects(jobs.JobOperator, bpy.types.Operator):
 
 
 class MPHDRR_OT_mesh_from_volume(jobs.JobOperator, bpy.types.Operator):
-    """Make a closed mesh of the active volume's surface of one value, for display and print"""
+    """Make a closed mesh of the active volume's surface of one value, for display and print."""
 
     dialog = {"confirm_text": "Make"}
 

@@ -41,7 +41,7 @@ def _angle(name: str, description: str, default: float) -> object:
 
 
 class MPHDRR_OT_add_xray_system(Reported, bpy.types.Operator):
-    """Add X-ray sources, each with its panel opposite, as a scanner beside the pinhole modules, and make it active"""
+    """Add X-ray sources, each with its panel opposite, as a scanner beside the pinhole modules, and make it active."""
 
     bl_label = "Add X-ray System"
 
@@ -97,7 +97,7 @@ class MPHDRR_OT_add_xray_system(Reported, bpy.types.Operator):
 
 class MPHDRR_OT_use_ct(jobs.JobOperator, bpy.types.Operator):
     """Convert the reconstructed CT to CT numbers, and reconstruct SPECT with them: from now on the panels are about the
-    pinholes and the activity. The body that the X rays saw attenuates its photons
+    pinholes and the activity. The body that the X rays saw attenuates its photons.
     """
 
     bl_label = "Use CT for SPECT"

@@ -5,6 +5,7 @@ runs.py, reconstruction.py, event_set.py. What they have in common is in sidebar
 
 - A panel is a class `MPHDRR_PT_...` in the file of its subject, found without a list; its label follows from its name, and
   its docstring is its tooltip. Its place is `bl_order` (`addon/blender/ids.py`).
-- A setting of projections or reconstructions appears by itself; which panel shows it is decided by `_MAIN` and `_PHYSICS`.
-- Each operator has a line in a menu of menus.py; `tests/blender/test_menus.py` misses those without.
+- A setting of projections or reconstructions appears by itself; which panel shows it is decided by `_MAIN` and `_PHYSICS`
+  (projections.py, reconstruction.py); what it shows for a number that is not given is `unset` of its `Setting`.
+- Each operator has a line in a menu of menus.py; `tests/blender/test_words.py` misses those without.
 """

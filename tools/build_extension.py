@@ -65,7 +65,7 @@ PLATFORMS = {
 
 
 def download(folder: Path, packages: tuple[str, ...], *options: str) -> list[Path]:
-    """Give the wheels of `packages` in `folder`, downloaded unless a stamp there says that they are complete."""
+    """Return the wheels of `packages` in `folder`, downloaded unless a stamp there says that they are complete."""
     stamp = folder / ".complete"
     asked = " ".join((*packages, *options))
     if not (stamp.is_file() and stamp.read_text() == asked):
@@ -77,7 +77,7 @@ def download(folder: Path, packages: tuple[str, ...], *options: str) -> list[Pat
 
 
 def wheels_for(name: str, folder: Path) -> list[Path]:
-    """Give all wheels of one platform."""
+    """Return all wheels of one platform."""
     platform = PLATFORMS[name]
     tags = [option for tag in platform.tags for option in ("--platform", tag)]
     wheels = download(folder / "any", PURE)
@@ -89,7 +89,7 @@ def wheels_for(name: str, folder: Path) -> list[Path]:
 
 
 def source_files() -> list[Path]:
-    """Give the files of the tree that git does not ignore, relative to the root; the manifest chooses those to pack."""
+    """Return the files of the tree that git does not ignore, relative to the root; the manifest chooses those to pack."""
     command = ("git", "ls-files", "-z", "--cached", "--others", "--exclude-standard")
     names = subprocess.run(command, cwd=ROOT, check=True, capture_output=True, text=True).stdout.split("\0")
     return [Path(name) for name in names if name and (ROOT / name).is_file()]
@@ -162,7 +162,7 @@ def toml_list(values: list[str]) -> str:
 
 
 def extension_tool() -> Path:
-    """Give Blender's command-line tool for extensions, from the bpy wheel, without importing bpy."""
+    """Return Blender's command-line tool for extensions, from the bpy wheel, without importing bpy."""
     spec = importlib.util.find_spec("bpy")
     if spec is None or not spec.submodule_search_locations:
         raise SystemExit("bpy is not installed here; run this as: make dist")

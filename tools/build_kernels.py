@@ -32,7 +32,7 @@ FLAGS = (
 
 @dataclass(frozen=True)
 class Platform:
-    """The compiler's and pip's names of a platform, its library's name, and the flags of each level of its processors."""
+    """The names of a platform for compiler and pip, its library's name, and the flags of each processor level."""
 
     target: str
     tag: str
@@ -51,7 +51,7 @@ PLATFORMS = {
 
 
 def this_platform() -> str | None:
-    """Give the name of the platform that this Python runs on, or None if the kernels are not built for it."""
+    """Return the name of the platform that this Python runs on, or None if the kernels are not built for it."""
     system = {"linux": "linux", "win32": "windows", "darwin": "macos"}.get(sys.platform)
     machine = {"x86_64": "x64", "amd64": "x64", "aarch64": "arm64", "arm64": "arm64"}.get(platform.machine().lower())
     if sys.maxsize < 2**32 or (system == "linux" and platform.libc_ver()[0] != "glibc"):
@@ -67,7 +67,7 @@ def zig(*arguments: str | Path, cwd: str | Path) -> None:
 
 
 def compiled(name: str, folder: str | Path, flags: tuple[str, ...] = FLAGS) -> list[str]:
-    """Compile the object files of platform `name`'s library into `folder`, and give their names."""
+    """Compile the object files of platform `name`'s library into `folder`, and return their names."""
     made_for = PLATFORMS[name]
     calls: list[tuple[str, str, tuple[str, ...]]] = [("levels.o", "levels.c", ())]
     for level, options in enumerate(made_for.levels):
@@ -86,7 +86,7 @@ def compiled(name: str, folder: str | Path, flags: tuple[str, ...] = FLAGS) -> l
 
 
 def build(name: str, folder: Path) -> Path:
-    """Compile the library of platform `name` into `folder`, which is made if necessary, and give its path.
+    """Compile the library of platform `name` into `folder`, which is made if necessary, and return its path.
 
     The kernels call no C library, so none is linked, only the compiler's own functions; to prepare Windows' would take Zig
     two minutes.

@@ -64,7 +64,7 @@ class Picture:
         self.parts.append(f'<circle cx="{at[0]:.1f}" cy="{at[1]:.1f}" r="{radius}"/>')
 
     def circle(self, at: Point, radius: float, look: str = "") -> None:
-        """Draw a circle as a path, so that it looks as lines do."""
+        """Draw a circle as a path, which looks as lines do."""
         turn = np.linspace(0, 2 * np.pi, 73)
         self.path(np.asarray(at) + radius * np.stack([np.cos(turn), np.sin(turn)], 1), look, closed=True)
 
@@ -76,7 +76,7 @@ class Picture:
 
 
 def draw_frames() -> None:
-    """World and module frame."""
+    """Draw world and module frame."""
     p, length, side = np.array([-156.0, 42.0, 55.0]), 65.0, 56.0
     u, v, k = module_frames(p[None])[0]
     right, up = np.array([0.80, -0.60, 0.0]), np.array([0.26, 0.35, 0.90])  # a parallel view from above
@@ -111,7 +111,7 @@ def draw_frames() -> None:
 
 
 def draw_detectors() -> None:
-    """Real and virtual detector, from the side."""
+    """Draw real and virtual detector, from the side."""
     picture = Picture("The real detector behind the pinhole and the virtual one in front of it", 760, 400)
     pinhole, length, factor, distance, half = np.array([150.0, 205.0]), 62.0, 8.0, 250.0, 17.0
     far, near = pinhole[0] + factor * length, pinhole[0] - length
@@ -155,7 +155,7 @@ def draw_detectors() -> None:
 
 
 def draw_arrays() -> None:
-    """Order of pixels, and voxels' indices."""
+    """Draw the order of pixels, and voxels' indices."""
     picture = Picture("The order of pixels in arrays and pictures, and the index of a voxel", 760, 330)
     cell, rows, columns = 46, 3, 4
     for left, title, place in (
@@ -206,7 +206,7 @@ def draw_arrays() -> None:
 
 
 def draw_perspective() -> None:
-    """One view's cells in the world, and in its own coordinates."""
+    """Draw one view's cells in the world, and in its own coordinates."""
     picture = Picture("The cells of a perspective grid in the world, and in the view's own coordinates", 760, 430)
     pinhole, distance, pitch, columns = np.array([40.0, 205.0]), 320.0, 52.0, 5
     ks = np.linspace(4.0, 1.0, 7)
@@ -252,7 +252,7 @@ def draw_perspective() -> None:
 
 
 def draw_architecture() -> None:
-    """What becomes of what, and the room of core that does it."""
+    """Draw the flow of data from inputs to results, with the room of core that does each step."""
     picture = Picture("What becomes of what in mphDRR, and the folder that does it", 1000, 560)
 
     def box(x: float, y: float, name: str, room: str, look: str = "area") -> None:

@@ -52,7 +52,7 @@ LIBRARIES = {
 
 
 def version_of(python: str | Path) -> str | None:
-    """Give a version such as "3.11", or None if `python` does not run (such as a pyenv shim of an inactive version)."""
+    """Return a version such as "3.11", or None if `python` does not run (such as a pyenv shim of an inactive version)."""
     ask = "import sys; print('%d.%d' % sys.version_info[:2])"
     try:
         answer = subprocess.run([str(python), "-c", ask], capture_output=True, text=True, timeout=60)
@@ -62,7 +62,7 @@ def version_of(python: str | Path) -> str | None:
 
 
 def candidates(name: str) -> list[str | Path]:
-    """Interpreters to try, `name` first; a name that contains a version allows only that version."""
+    """Return the interpreters to try, `name` first; a name that contains a version allows only that version."""
     match = re.search(r"3\.\d+$", name)
     versions = (match.group(),) if match else VERSIONS
     found: list[str | Path] = [name, *(f"python{version}" for version in versions)]
@@ -76,7 +76,7 @@ def candidates(name: str) -> list[str | Path]:
 
 
 def find_python(name: str) -> tuple[str, str]:
-    """Give the interpreter to use and its version, or exit with one line."""
+    """Return the interpreter to use and its version, or exit with one line."""
     for python in candidates(name):
         version = version_of(python)
         if version in VERSIONS:
@@ -87,7 +87,7 @@ def find_python(name: str) -> tuple[str, str]:
 
 
 def missing_packages() -> list[str]:
-    """Debian packages of the system libraries that bpy needs and this machine lacks."""
+    """Return the Debian packages of the system libraries that bpy needs and this machine lacks."""
     if not sys.platform.startswith("linux"):
         return []
     missing = []
@@ -120,7 +120,7 @@ def add_adapted(venv: Path, torch: str) -> bool:
 
 
 def kernels_changed() -> bool:
-    """Whether the library of the C kernels is missing in the tree, or older than its sources."""
+    """Return whether the library of the C kernels is missing in the tree, or older than its sources."""
     sources = (ROOT / "tools/build_kernels.py", *KERNELS.glob("*.[ch]"))
     libraries = [file for file in KERNELS.iterdir() if file.suffix in (".so", ".dylib", ".dll")]
     return not libraries or libraries[0].stat().st_mtime < max(file.stat().st_mtime for file in sources)

@@ -15,7 +15,7 @@ NOTEBOOK = ROOT / "examples" / "from_diffdrr.ipynb"
 
 
 def notebook(page: str) -> str:
-    """A page as a Jupyter notebook: its blocks of Python are the code, and what is between them the text."""
+    """Convert a page to a Jupyter notebook: its blocks of Python become code cells, the rest text cells."""
     cells = []
     for k, text in enumerate(re.split(r"^```python\n(.*?)^```$", page, flags=re.MULTILINE | re.DOTALL)):
         source = text.strip() if k % 2 else re.sub(r"\]\(([\w-]+\.md)", r"](../docs/\1", text.strip())

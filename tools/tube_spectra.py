@@ -23,7 +23,7 @@ HEAD = f"""\
 
 
 def line(kvp: int) -> str:
-    """One tube voltage's line of the table."""
+    """Return one tube voltage's line of the table."""
     energies, per_cm2_and_kev = spekpy.Spek(kvp=kvp, th=ANGLE, dk=STEP, z=100, mas=1).get_spectrum()
     photons = per_cm2_and_kev[energies > LOWEST] * STEP / 100
     return " ".join([str(kvp), *(f"{value:.5g}" for value in photons)])

@@ -16,7 +16,7 @@ CLICKS = ROOT / "out" / "test-app" / "test_six_clicks_lead_from_an_empty_scene_o
 
 
 def clicks() -> None:
-    """Four of the six clicks to a dose map, on one page."""
+    """Write four of the six clicks to a dose map, on one page."""
     shown = (0, 28, 1313, 905)  # without menus and what stands beside the two editors
     taken = [Image.open(CLICKS / f"click-{number}.png").convert("RGB").crop(shown) for number in (1, 2, 4, 5)]
     width, height = (round(0.7 * side) for side in taken[0].size)
@@ -28,7 +28,7 @@ def clicks() -> None:
 
 
 def main() -> None:
-    """Do so."""
+    """Write the tutorial's pictures anew."""
     FOLDER.mkdir(exist_ok=True)
     for old in FOLDER.iterdir():
         old.unlink()

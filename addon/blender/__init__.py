@@ -6,4 +6,8 @@ into Blender's properties, and `updates.on_edit` calls what rebuilds or draws, b
 
 To add a job, write a function of a higher room that returns a `Job`, and an operator that inherits from `JobOperator`.
 To follow a new Blender version, change `compat.py` alone. A new choice of an enumeration needs no number in `choices.py`.
+
+Facts of single files: core's messages are put into the window's words by `reports.in_window`; which files a volume has,
+and what Save As and Collect Files bring along, is storage.py (`resume_file`, `file_references`); what waits until the
+scene rests is timers.py; `core.progress.stages_of` has the words of a job's stages.
 """

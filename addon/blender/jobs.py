@@ -111,6 +111,7 @@ class Worker(threading.Thread):
         self._can_stop = False
 
     def run(self) -> None:
+        """Do the work and keep its result or its error, with the warnings."""
         with recorded_warnings() as self.warnings:
             try:
                 self.result = self.work(StagedProgress(self._begin, self.label))
@@ -212,9 +213,8 @@ class JobOperator:
         bl_label: str
         properties: Any
         filepath: str  # only of an operator that reads or writes a file
-
-        def report(self, type: set[str], message: str) -> None: ...
-        def as_keywords(self, *, ignore: tuple[str, ...] = ()) -> dict[str, Any]: ...
+        report: Callable[[set[str], str], None]
+        as_keywords: Callable[..., dict[str, Any]]
 
     def job(self, context: bpy.types.Context) -> Job:
         """Return the job, from the operator's and the scene's settings, or raise `InputError`."""

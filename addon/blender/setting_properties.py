@@ -6,8 +6,9 @@ from typing import Any
 from bpy import props
 
 from ...core.errors import InputError, expecting
-from ...core.runs.recipe import is_met
-from ...core.runs.settings import Setting
+from ...core.recipes.settings import Setting
+from ...core.recipes.values import is_met
+from ...core.runs.settings import SETTINGS
 from . import choices, decimals, layouts, storage
 
 Settings = Mapping[str, Setting]
@@ -162,7 +163,7 @@ def properties_to_draw(
     for name, setting in settings.items():
         if table and not setting.key.startswith(f"{table}."):
             continue
-        unmet = [need for need in setting.needs if not is_met(values, need)]
+        unmet = [need for need in setting.needs if not is_met(values, need, SETTINGS)]
         if any(map(is_hidden, unmet)):
             continue
         material = material_property(name, setting)

@@ -15,8 +15,8 @@ from ...core.figures.kinds import FILMS, KINDS, PAPERS, SAMPLES, FigureKind, Ren
 from ...core.figures.page import SUFFIXES, Page
 from ...core.figures.subject import NEEDS, FigureSubject, require
 from ...core.phantoms.kinds import KINDS as PHANTOMS
-from ...core.runs.formats import FORMATS
-from ...core.toml import read_toml
+from ...core.recipes.toml import read_toml
+from ...core.runs import FORMATS
 from . import COMMANDS
 from .scene import new_scene, quiet
 

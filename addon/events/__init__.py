@@ -5,4 +5,6 @@
 
 A setting of event sets belongs to `core/events/recipe.py`: a job here needs a change only if its value cannot be a
 phantom's setting, as the factor of activity in `_store_phantom`.
+
+The panel's notes are read by `_read_recipe` and `_read_set` of event_notes.py, in a thread.
 """

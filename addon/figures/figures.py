@@ -25,8 +25,7 @@ from ...core.figures.kinds import KINDS, SAMPLES, FigureKind, Rendering, figure_
 from ...core.figures.page import DARK, Page, box
 from ...core.figures.parts import bar_width, color_bar, heading, heading_height
 from ...core.figures.subject import FigureSubject, require
-from ...core.runs.display import Display
-from ...core.runs.resizing import resized
+from ...core.runs.display import Display, resize_picture
 from ..blender import ids, jobs, storage, timers, windows
 from ..blender.choices import items
 from ..phantoms import phantoms
@@ -274,7 +273,7 @@ def _are_visible(scene: bpy.types.Scene, items: list[bpy.types.Object]) -> Gener
         pictures.append((yield from _render_pixels(scene)).astype(int))
     render.resolution_percentage, cycles.use_denoising, cycles.samples = 100, True, samples
     rows, columns = (n // 8 for n in pictures[0].shape[:2])  # means over blocks have less noise
-    return bool(np.abs(resized(pictures[0] - pictures[1], rows, columns)).max() > _THRESHOLD)
+    return bool(np.abs(resize_picture(pictures[0] - pictures[1], rows, columns)).max() > _THRESHOLD)
 
 
 def before_render(scene: bpy.types.Scene, *_: Any) -> None:

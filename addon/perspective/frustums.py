@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from ...core import InputError, PerspectiveGrid, Views, from_perspective, memory, to_perspective
 from ...core.geometry.frames import affine_matrix
 from ...core.progress import Progress, Stages, stages_of, tell
-from ...core.runs.mosaic import as_seen, png
+from ...core.runs.mosaic import as_seen, png_bytes
 from ...core.runs.run_recipe import recipe_views
 from ...core.volumes.volume import Volume, outside_value
 from ..blender import ids, jobs, objects
@@ -69,7 +69,7 @@ def frustum_job(context: bpy.types.Context, planes: int, uniform: str) -> jobs.J
         _, g, array = _resample_to_frustum(request, planes, uniform, stages)
         packing, files = stages("packing"), list[bytes]()
         for layer in np.moveaxis(array, 2, 0):
-            files.append(png(color_values(as_seen(layer.T), quantity, low, high), _PNG_LEVEL))
+            files.append(png_bytes(color_values(as_seen(layer.T), quantity, low, high), _PNG_LEVEL))
             tell(packing, len(files), planes)
         return g, files
 

@@ -15,11 +15,11 @@ import bpy
 import numpy as np
 from numpy.typing import NDArray
 
-from ...core import PinholeSystem, ProjectionRun, Views, memory
+from ...core import ProjectionRun, Views, memory
 from ...core.progress import Progress, part_of, tell
 from ...core.runs.display import Display
 from ...core.runs.exr import exr_bytes
-from ...core.runs.mosaic import Sheet, as_seen, labels, png, sheet, smaller
+from ...core.runs.mosaic import MosaicSheet, as_seen, block_means, draw_sheet, module_labels, png_bytes
 from ..blender import ids, jobs, reports, windows
 
 _KEY = "mphdrr_projection"  # custom property of images that a new run replaces: True of a run's, False of a file's
@@ -47,7 +47,7 @@ class Pictures:
     exact: list[bytes]  # OpenEXR files of float32 numbers, one per module
     colored: list[bytes]  # PNG files, one per module
     mosaic: bytes  # PNG file
-    layout: Sheet  # layout of the mosaic's tiles
+    layout: MosaicSheet  # layout of the mosaic's tiles
 
 
 def make_pictures(run: ProjectionRun, display: Display, progress: Progress | None = None) -> Pictures:
@@ -55,7 +55,9 @@ def make_pictures(run: ProjectionRun, display: Display, progress: Progress | Non
     exact = _make_all(exr_bytes, as_seen(run.projections), part_of(progress, 0, 2))
     rings = run.system.rings().tolist()
     colored = _color(run.projections, display, part_of(progress, 1, 2))
-    return Pictures(display, exact, colored, *_draw_mosaic(run.projections, labels(run), rings, run.unit, display))
+    return Pictures(
+        display, exact, colored, *_draw_mosaic(run.projections, module_labels(run), rings, run.unit, display)
+    )
 
 
 def store_images(run: ProjectionRun, files: Pictures) -> Generator[tuple[str, int, int] | None, None, bpy.types.Image]:
@@ -83,11 +85,9 @@ def store_images(run: ProjectionRun, files: Pictures) -> Generator[tuple[str, in
     _replace_images(new_images)
     mosaic = new_images[ids.MOSAIC]
     _store_tiles(mosaic, files.layout, numbers, run.system.rings().tolist(), run.unit, files.display)
-    mosaic[_LABELS] = "\n".join(labels(run))
+    mosaic[_LABELS] = "\n".join(module_labels(run))
     arrays = {name: getattr(run.views, name).ravel().tolist() for name in _ARRAYS}
-    system = run.system
-    radii = system.roi_radius if isinstance(system, PinholeSystem) else np.full(len(system), system.region_radius())
-    mosaic[_VIEWS] = arrays | {"shape": run.views.shape, "roi_radius": radii.tolist()}
+    mosaic[_VIEWS] = arrays | {"shape": run.views.shape, "roi_radius": run.system.roi_radii().tolist()}
     return mosaic
 
 
@@ -201,16 +201,16 @@ def projection_name(number: int, numbers: list[int]) -> str:
 def _color(projections: NDArray[np.float32], display: Display, progress: Progress | None = None) -> list[bytes]:
     """Return the pictures of projections (M, n_v, n_u) in one window, as PNG files; `progress` counts them."""
     window = display.window(projections)
-    shown_pictures = smaller(as_seen(display.part(projections)), _MAX_PIXELS)
-    return _make_all(lambda picture: png(display.colored(picture, window), _PNG_LEVEL), shown_pictures, progress)
+    shown_pictures = block_means(as_seen(display.part(projections)), _MAX_PIXELS)
+    return _make_all(lambda picture: png_bytes(display.colored(picture, window), _PNG_LEVEL), shown_pictures, progress)
 
 
 def _draw_mosaic(
     projections: NDArray[np.float32], texts: list[str], rings: list[int], unit: str, display: Display
-) -> tuple[bytes, Sheet]:
+) -> tuple[bytes, MosaicSheet]:
     """Return the mosaic of projections (M, n_v, n_u), with a text in each tile, as a PNG file, and its layout."""
-    layout = sheet(projections, texts, rings, unit, display)
-    return png(layout.picture, _PNG_LEVEL), layout
+    layout = draw_sheet(projections, texts, rings, unit, display)
+    return png_bytes(layout.picture, _PNG_LEVEL), layout
 
 
 def _make_all(make: Callable[[Any], bytes], pictures: NDArray[np.float32], progress: Progress | None) -> list[bytes]:
@@ -224,7 +224,12 @@ def _make_all(make: Callable[[Any], bytes], pictures: NDArray[np.float32], progr
 
 
 def _store_tiles(
-    image: bpy.types.Image, layout: Sheet, numbers: list[int], rings: list[int], unit: str, display: Display | None
+    image: bpy.types.Image,
+    layout: MosaicSheet,
+    numbers: list[int],
+    rings: list[int],
+    unit: str,
+    display: Display | None,
 ) -> None:
     """Store the mosaic's layout on its image, and the display of all pictures; None if they have different ones."""
     image[_TILES] = {
@@ -235,9 +240,9 @@ def _store_tiles(
     }  # fmt: skip
 
 
-def store_difference(layout: Sheet, numbers: list[int], unit: str, text: str) -> bpy.types.Image:
+def store_difference(layout: MosaicSheet, numbers: list[int], unit: str, text: str) -> bpy.types.Image:
     """Store the image of the difference of two runs until other projections are shown; `text` has its numbers."""
-    image = _store_image(ids.DIFFERENCE, png(layout.picture, _PNG_LEVEL))
+    image = _store_image(ids.DIFFERENCE, png_bytes(layout.picture, _PNG_LEVEL))
     _store_tiles(image, layout, numbers, [], unit, None)
     image[_TEXT] = text
     return image

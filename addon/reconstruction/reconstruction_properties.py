@@ -10,7 +10,8 @@ import bpy
 from bpy.props import EnumProperty, PointerProperty, StringProperty
 
 from ...core.perspective.backprojection import HOW
-from ...core.reconstruction.methods import METHOD_FILES, METHODS
+from ...core.reconstruction.method_files import METHOD_FILES
+from ...core.reconstruction.methods import METHODS
 from ...core.runs.recipe import Recipe, fitting_recipe
 from ...core.runs.settings import SETTINGS
 from ..blender import choices

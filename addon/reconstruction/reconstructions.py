@@ -29,10 +29,10 @@ from ...core.figures.reconstructions import SIZE, SIZE_BESIDE_TRUTH, draw
 from ...core.progress import Progress, stages_of
 from ...core.reconstruction.methods import method_of
 from ...core.reconstruction.result import iterations_text
-from ...core.runs.mosaic import png
-from ...core.runs.recipe import recipe_of_tables
+from ...core.runs.mosaic import png_bytes
+from ...core.runs.recipe import recipe_from_tables
 from ...core.runs.reconstructing import reconstruct_run, reconstruction_grid, voxels_text
-from ...core.runs.run_recipe import truth_of_run
+from ...core.runs.run_recipe import run_truth
 from ...core.volumes.sights import bright_value, full_slices
 from ..blender import ids, jobs, objects, storage, windows
 from ..pictures import images
@@ -94,7 +94,9 @@ def continue_job(context: bpy.types.Context) -> jobs.Job:
         (reconstruction.volume,), volumes.pose_of_object(item), storage.absolute(item.data.filepath),
         float(values.min()), float(values.max()), extent,
     )  # fmt: skip
-    recipe = recipe_of_tables(reconstruction.settings["recipe"]).updated({"reconstruction.iterations": MORE_ITERATIONS})
+    recipe = recipe_from_tables(reconstruction.settings["recipe"]).updated(
+        {"reconstruction.iterations": MORE_ITERATIONS}
+    )
     previous = _PreviousResult(item.session_uid, reconstruction, stored)
     return _make_job(context, recipe, rendering.run_file_path(run.file), run.name, previous)
 
@@ -252,21 +254,17 @@ class _LiveResult:
 
 
 def _scores(run: ProjectionRun, volume: Volume, progress: Progress | None) -> dict[str, Any]:
-    """The scores beside the truth as the panel shows them; none of a measured run.
+    """Return the scores beside the truth as the panel shows them; none of a measured run.
 
     They are names and values in words; of rods their size, light, valley/peak, or why there is none, and contrast.
     """
     if run.volume is None:
         return {}
     try:
-        score = score_volume(volume, *truth_of_run(run), progress)
+        score = score_volume(volume, *run_truth(run), progress)
     except InputError as error:  # such as a truth that is the same everywhere: the reconstruction is worth keeping
         return {"scores": [("No score", str(error))]}
-    lines = [("NRMSE", f"{score.nrmse:.3g}")]
-    for sphere in score.nema or ():
-        score_text = f"{sphere.contrast_recovery:.1f} % contrast, {sphere.background_variability:.1f} % variability"
-        lines.append((f"{sphere.diameter:g} mm sphere", score_text))
-    return {"scores": lines, "rods": [sector.cells for sector in score.derenzo or () if sector.rod_diameter]}
+    return {"scores": score.cells, "rods": [sector.cells for sector in score.derenzo or () if sector.rod_diameter]}
 
 
 def _draw_picture(
@@ -279,7 +277,7 @@ def _draw_picture(
     line = ", ".join([record["title"], *map(" ".join, record["scores"][:1]), record["voxels"]])
     lines, title = [line, *record["flatters"]], f"Reconstruction of {name}"
     draw(page, volume, record["objective"], run.volume, title, lines, record["name"], record["rods"])
-    return png(page.picture, _PNG_LEVEL)
+    return png_bytes(page.picture, _PNG_LEVEL)
 
 
 def _mu_readers(scene: bpy.types.Scene) -> dict[str, Callable[[], Volume]]:

@@ -10,7 +10,7 @@ from ...core.design.calibration import Calibration
 from ...core.design.calibration_recipe import run_calibration
 from ...core.errors import InputError
 from ...core.progress import Progress
-from ...core.runs.mosaic import png
+from ...core.runs.mosaic import png_bytes
 from ..blender import ids, jobs
 from ..pictures import images
 from ..scanner import arrows, module_edits, scanner
@@ -31,7 +31,7 @@ def calibrate_job(context: bpy.types.Context, path: Path, apply: bool = True, ex
 
     def work(progress: Progress) -> tuple[Calibration, bytes]:
         calibration = run_calibration(path, progress)
-        return calibration, png(calibration.residual_sheet().picture)
+        return calibration, png_bytes(calibration.residual_sheet().picture)
 
     def finish(result: tuple[Calibration, bytes]) -> str:
         calibration, picture = result

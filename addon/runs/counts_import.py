@@ -10,7 +10,7 @@ from ...core import InputError, ProjectionRun
 from ...core.geometry.system import chosen_modules
 from ...core.progress import Progress, stages_of
 from ...core.runs.measured import recipe_counts
-from ...core.runs.mosaic import caption
+from ...core.runs.mosaic import counts_caption
 from ..blender import jobs
 from ..phantoms import phantoms
 from ..pictures import images
@@ -54,10 +54,9 @@ def import_counts_job(context: bpy.types.Context, paths: list[Path], entries: Ma
         run, pictures = result
         scene = jobs.require_scene(scene_uid, "the projections are")
         owner = jobs.find_by_uid(bpy.data.collections, scanner_uid)
-        state = runs.scene_state(system, run.recipe, None, None) | {"measured": caption(run)}
+        state = runs.scene_state(system, run.recipe, None, None) | {"measured": counts_caption(run)}
         images.show_below((yield from rendering.store_and_show(scene, run, path, state, owner, pictures)), bpy.context)
-        return (
-            f"Imported {float(run.projections.sum(dtype=float)):.6g} counts of {len(run.views)} modules: {caption(run)}"
-        )
+        total = f"{float(run.projections.sum(dtype=float)):.6g} counts of {len(run.views)} modules"
+        return f"Imported {total}: {counts_caption(run)}"
 
     return jobs.Job("Importing counts", work, finish, lambda: path.unlink(missing_ok=True))

@@ -20,7 +20,7 @@ from ...core import InputError, PinholeSystem, ProjectionRun, Recipe, Views, Vol
 from ...core.geometry.scanner import Scanner
 from ...core.memory import readable_size
 from ...core.runs.display import Display
-from ...core.runs.mosaic import as_seen, sized, totals
+from ...core.runs.mosaic import as_seen, fit_images, image_totals
 from ...core.runs.run_recipe import recipe_model, recipe_views, run_recipe
 from ..blender import jobs, reports, timers, windows
 from ..phantoms import phantoms
@@ -125,10 +125,10 @@ def make_preview(request: Request, quick: bool, voxels: dict[Path, Volume]) -> P
     projections = run.projections
     if run.unit == "counts" and quick:  # counts per pixel of the panel's size, as in the full picture
         projections = projections * np.float32(_pixel_area(recipe_views(recipe, system)) / _pixel_area(run.views))
-    word, (total,) = totals(display.part(run.projections), run.unit)
+    word, (total,) = image_totals(display.part(run.projections), run.unit)
     low, high = window = display.window(projections)
     shown_part = display.part(projections)
-    picture = display.colored(sized(as_seen(shown_part), _SHOWN_PIXELS)[0], window)
+    picture = display.colored(fit_images(as_seen(shown_part), _SHOWN_PIXELS)[0], window)
     bar = [display.value_at(share, window) for share in np.linspace(0.0, 1.0, 256)]
     colors = display.colored([bar], window)
     rows, columns = run.views.shape

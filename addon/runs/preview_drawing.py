@@ -13,7 +13,7 @@ import numpy as np
 from gpu_extras.batch import batch_for_shader
 from numpy.typing import NDArray
 
-from ...core.runs.letters import wrapped
+from ...core.runs.letters import wrap_text
 from ..blender import windows
 
 # Lengths in units of Blender's interface: width and smallest height of the picture; free space above and beside it for the
@@ -95,7 +95,7 @@ def _draw_box(session: Any) -> None:
     def fits(text: str) -> bool:
         return windows.text_width(text, size) <= _WIDTH * unit
 
-    lines = [piece for line in session.lines for piece in wrapped(line, fits)]
+    lines = [piece for line in session.lines for piece in wrap_text(line, fits)]
     if preview is not None:
         rows, columns = preview.picture.shape[:2]
         free_height = context.region.height - _ABOVE * unit - 2 * margin - (1.4 * len(lines) + 2) * size

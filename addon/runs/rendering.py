@@ -19,7 +19,7 @@ from ...core.geometry.system import chosen_modules
 from ...core.progress import Progress, Stages, stages_of
 from ...core.projector import Model
 from ...core.runs.display import Display
-from ...core.runs.mosaic import caption
+from ...core.runs.mosaic import counts_caption
 from ...core.runs.projecting import warn_of_energy
 from ...core.runs.run_recipe import recipe_model, run_recipe, with_phantom
 from ...core.volumes.volume import require_quantity
@@ -200,7 +200,7 @@ def adopt_settings(scene: bpy.types.Scene, run: ProjectionRun, volume: bpy.types
         _set_physics(scene, recipe)
     state = runs.scene_state(run.system, recipe, volume, None)
     if volume is None:
-        return state | {"measured": caption(run)}
+        return state | {"measured": counts_caption(run)}
     attenuates = [value for key, value in recipe.given.items() if key.startswith("attenuation.") and value]
     return state | {"mu": {"name": f"of {run.settings['volume']}"}} if attenuates else state
 
@@ -284,8 +284,8 @@ def _show_active_run() -> float | None:
     windows = bpy.context.window_manager.windows
     with bpy.context.temp_override(window=windows[0]) if windows else contextlib.nullcontext():
         scene = bpy.context.scene
-        settings, shown = scene.mphdrr_projections, runs.shown_run(scene)
-        if settings.active_run < len(settings.runs) and settings.runs[settings.active_run] != shown:
+        settings, current_run = scene.mphdrr_projections, runs.shown_run(scene)
+        if settings.active_run < len(settings.runs) and settings.runs[settings.active_run] != current_run:
             try:
                 bpy.ops.mphdrr.show_run("INVOKE_DEFAULT", index=settings.active_run)
             except RuntimeError as error:  # for example that its file is gone

@@ -16,9 +16,10 @@ import numpy as np
 from ...core.errors import InputError, refusing
 from ...core.geometry.scanner import Scanner
 from ...core.memory import readable_size
+from ...core.recipes.settings import Setting
 from ...core.runs.recipe import Recipe, fitting_recipe
 from ...core.runs.run import ProjectionRun
-from ...core.runs.settings import SAMPLING, SETTINGS, Setting
+from ...core.runs.settings import SAMPLING, SETTINGS
 from ..blender import decimals, ids, objects, reports, storage, timers, windows
 from ..phantoms import phantoms
 from ..scanner import following, module_values, scanner, scanner_parts

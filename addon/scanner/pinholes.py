@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 from ...core import InputError, Optics, PinholeSystem, isocentre_performance, resolution, sensitivity
 from ...core.geometry import checks
 from ...core.geometry.collimator import Construction, EdgePlace
-from ...core.geometry.finding import Finding
-from ...core.geometry.scanner import Scanner
+from ...core.geometry.scanner import Finding, Scanner
 from ..blender.decimals import typed
 from . import collimators
 from .module_values import ScannerType

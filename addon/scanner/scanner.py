@@ -15,8 +15,7 @@ from mathutils import Quaternion
 
 from ...core import InputError, PinholeSystem
 from ...core.geometry.collimator import Construction
-from ...core.geometry.finding import Finding
-from ...core.geometry.scanner import Scanner
+from ...core.geometry.scanner import Finding, Scanner
 from ...core.scanner_kinds import SCANNERS
 from ...core.workbook import ColumnMap, QuantityCells, SystemSource
 from ..blender import ids, objects, storage
@@ -54,7 +53,7 @@ def build_scanner(
         raise InputError(
             f"scanner '{name}' has changed since it was imported ({'; '.join(lost)}): set replace=True to drop the changes"
         )
-    new_scanner = NewScanner(system, system.parts(construction if isinstance(system, PinholeSystem) else None))
+    new_scanner = NewScanner(system, system.parts(construction))
     hidden_numbers: set[int] = set()
     if old is None:
         collection = bpy.data.collections.new(name)

@@ -5,4 +5,9 @@
 
 To add a colour ramp or a look for the Asset Browser, add a line to `_LOOKS` in `volume_materials.py`; a look of the
 Phantom panel is a line of `LOOKS` in `addon/phantoms/phantom_properties.py`, and `looks.py` draws it.
+
+Colours and the unit that the window shows are `ramp` and `display_unit` (volume_materials.py): slices, colour bar and
+surfaces follow; `item_ramp` reads colours as the user has edited them, `set_look_inputs` writes a look's inputs. Files
+with other endings are read by `core/volumes/volume_files.py`; `operators/dropped_files.py` says which operator opens
+which.
 """

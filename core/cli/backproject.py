@@ -4,7 +4,7 @@ import argparse
 
 from ... import core as mph
 from ..perspective.backprojection import HOW
-from ..runs.formats import FORMATS
+from ..runs import FORMATS
 from ..runs.settings import SETTINGS
 from ..volumes.volume_files import VOLUME_FORMATS
 from .options import add_run, describe_volume, output_path, print_answer, progress_bar

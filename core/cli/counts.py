@@ -2,7 +2,7 @@
 
 import argparse
 
-from ..runs.formats import FORMATS
+from ..runs import FORMATS
 from .options import add_actions, add_run, output_path, print_answer
 
 

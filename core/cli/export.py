@@ -3,7 +3,7 @@
 import argparse
 
 from ... import core as mph
-from ..runs.formats import FORMATS
+from ..runs import FORMATS
 from ..runs.mosaic import write_sheet
 from .options import add_run, output_path
 

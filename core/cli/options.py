@@ -95,6 +95,14 @@ def add_command(subparsers, name: str, summary: str, example: str, run: Any = No
     return parser
 
 
+def add_set_action(actions: Any, name: str, run: Callable[[argparse.Namespace], None]) -> argparse.ArgumentParser:
+    """Return the parser of an action on an event set, with SET and ``--json``; its help is the docstring of `run`."""
+    parser = add_run(actions, name, run)
+    parser.add_argument("folder", metavar="SET", help="folder of the set")
+    parser.add_argument("--json", action="store_true", help="print the answer as JSON")
+    return parser
+
+
 def add_actions(subparsers: Any, name: str, example: str, metavar: str = "ACTION") -> Any:
     """Add a command of `COMMANDS` that consists of actions, and return the subparsers to which these are added."""
     return add_command(subparsers, name, COMMANDS[name], example).add_subparsers(metavar=metavar, required=True)

@@ -13,7 +13,7 @@ from typing import Any
 from ... import core as mph
 from ..phantoms.kinds import KINDS
 from ..physics.ct_numbers import CT_ENERGY
-from ..runs.formats import FORMATS
+from ..runs import FORMATS
 from ..runs.mosaic import write_sheet
 from ..runs.presets import PRESETS
 from ..runs.settings import SETTINGS
@@ -135,7 +135,7 @@ def _run(arguments: argparse.Namespace) -> None:
     mphdrr project scanner.xlsx --counts counts.npy --frames 1-80 --orientation front+v --time 600 -o run.h5
         --mosaic check.png
     """
-    from ..runs.run_recipe import frames_of
+    from ..runs.run_recipe import recipe_frames
 
     if arguments.write_recipe:
         path = output_path(arguments.write_recipe, (".toml",))
@@ -148,7 +148,7 @@ def _run(arguments: argparse.Namespace) -> None:
     path = output_path(arguments.output, FORMATS)
     picture = output_path(arguments.mosaic) if arguments.mosaic else None
     recipe, data = _recipe_and_data(arguments)
-    n_runs = len(frames_of(recipe))
+    n_runs = len(recipe_frames(recipe))
     outputs = {numbered_path(path, number, n_runs).resolve() for number in range(1, n_runs + 1)}
     file_lists = (recipe[key] or () for key in ("volume.states", "counts.files", "attenuation.file"))
     for file in (*itertools.chain(*file_lists), recipe["volume.file"]):

@@ -5,7 +5,7 @@ import tomllib
 from typing import Any
 
 from ..errors import InputError
-from ..runs.settings import Setting
+from ..recipes.settings import Setting
 from .options import parse_number_or_name
 
 

@@ -13,7 +13,7 @@ from ... import core as mph
 from ..figures.page import DARK, SUFFIXES, Page
 from ..reconstruction.methods import Method, method_of
 from ..reconstruction.result import iterations_text
-from ..runs.formats import FORMATS
+from ..runs import FORMATS
 from ..runs.settings import HOW_TABLES, SETTINGS
 from ..volumes.volume_files import VOLUME_FORMATS
 from .options import add_run, output_path, progress_bar, say
@@ -47,14 +47,14 @@ def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
 
 def _recipe_from_options(arguments: argparse.Namespace, run: mph.ProjectionRun) -> mph.Recipe:
     """Return the recipe of the reconstruction: that of the run, changed by the recipe file and by the options."""
-    from ..runs.reconstructing import recipe_of
+    from ..runs.reconstructing import reconstruction_recipe
 
     file_recipe = mph.Recipe() if arguments.recipe is None else mph.read_recipe(arguments.recipe)
     changes = entries_from_options(arguments)
     for key in changes:
         if key.partition(".")[0] not in HOW_TABLES:
             raise mph.InputError(f"--set {key}: expected an entry of {', '.join(f'[{table}]' for table in HOW_TABLES)}")
-    recipe = recipe_of(run, file_recipe if "recipe" in run.settings else file_recipe.updated(changes))
+    recipe = reconstruction_recipe(run, file_recipe if "recipe" in run.settings else file_recipe.updated(changes))
     if changes.get("attenuation.file") is not None:  # it replaces what attenuated in the run
         changes = {"attenuation.of_phantom": None, "attenuation.object": None} | changes
     return recipe.updated(changes)

@@ -10,7 +10,7 @@ from ... import core as mph
 from ..arrays import Floats
 from ..errors import naming
 from ..figures.page import SUFFIXES, Page
-from ..runs.formats import FORMATS
+from ..runs import FORMATS
 from ..volumes.volume import UNITS
 from .options import add_run, output_path, print_answer, progress_bar, refuse
 from .phantom import Make, add_kinds, add_pose, read_pose
@@ -60,9 +60,9 @@ def _run(arguments: argparse.Namespace) -> None:
     volume = mph.read_volume(arguments.volume, arguments.quantity, progress=progress_bar("reading"))
     score = mph.score_volume(volume, truth, pose, progress_bar("truth"))
     if run is not None:
-        from ..runs.reconstructing import flattering
+        from ..runs.reconstructing import inverse_crime_notes
 
-        score = replace(score, notes=(*flattering(run, volume.grid), *score.notes))
+        score = replace(score, notes=(*inverse_crime_notes(run, volume.grid), *score.notes))
     if picture is not None:
         from ..figures.scores import SIZE, draw
 
@@ -90,8 +90,8 @@ def _read_truth(arguments: argparse.Namespace) -> _Truth:
             raise
         run = None
     if run is not None:
-        from ..runs.run_recipe import truth_of_run
+        from ..runs.run_recipe import run_truth
 
         with naming(file):
-            return *truth_of_run(run), run
+            return *run_truth(run), run
     return mph.read_volume(file, arguments.quantity, progress=progress_bar("reading the truth")), None, None

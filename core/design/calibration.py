@@ -14,7 +14,7 @@ from ..models.emission import Emission
 from ..models.model import with_image_axes
 from ..progress import Progress, stages_of
 from ..runs.display import DIVERGING, Display
-from ..runs.mosaic import Sheet, sheet
+from ..runs.mosaic import MosaicSheet, draw_sheet
 from ..validation import instance, one_of, positive, real_array, shape_text
 from .bundle import LENGTH, OFFSET, BundleAdjustment, FittedGeometry
 from .point_images import PixelLattice
@@ -108,11 +108,11 @@ class Calibration:
                 names_by_modules.setdefault(modules, []).append(name)
         return [f"{modules}: {', '.join(names)}" for modules, names in names_by_modules.items()]
 
-    def residual_sheet(self) -> Sheet:
+    def residual_sheet(self) -> MosaicSheet:
         """Draw the residuals of all modules, ring by ring: noise without a pattern where the geometry fits."""
         display = Display(colors=DIVERGING, low=-_COLOR_RANGE, high=_COLOR_RANGE)
         residuals = self.residuals.astype(np.float32)
-        return sheet(residuals, self.system.numbers, self.system.rings(), "standard deviations", display)
+        return draw_sheet(residuals, self.system.numbers, self.system.rings(), "standard deviations", display)
 
     def summary(self) -> list[str]:
         """Return lines with the modules' changes, those that do not fit, and the parameters that are not determined."""

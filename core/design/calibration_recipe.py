@@ -7,23 +7,23 @@ from typing import Any
 import numpy as np
 
 from ..errors import InputError, naming
-from ..events.entries import by_key, flat, required, table
 from ..files import AnyPath
 from ..geometry.system import PinholeSystem
 from ..models.emission import Emission
 from ..progress import Progress
+from ..recipes.settings import Setting, settings_by_key
+from ..recipes.tables import flat_entries, read_table, require_value
+from ..recipes.toml import read_toml
+from ..recipes.values import Values
 from ..runs.files import read_run
-from ..runs.recipe import Values
 from ..runs.run_recipe import recipe_model
-from ..runs.settings import Setting
-from ..toml import read_toml
 from ..validation import real_array
 from ..workbook import read_system
 from .bundle import LENGTH, OFFSET
 from .calibration import Calibration, calibrate
 
 _SD = "Standard deviation of "
-_ROWS = by_key((
+_ROWS = settings_by_key((
     Setting("runs.files", str, None, "Run files of counts, one of each acquisition", is_path=True, sizes=()),
     Setting("system.file", str, None, "Workbook of the runs' scanner, of which a calibrated copy is written", "a new one",
             is_path=True),
@@ -51,12 +51,14 @@ def run_calibration(path: AnyPath, progress: Progress | None = None) -> Calibrat
     """
     tables, folder = read_toml(path), Path(path).parent
     with naming(path):
-        sources = table(tables, "sources")
+        sources = read_table(tables, "sources")
         for name in sources.keys() - set(_SOURCES):
             raise InputError(f"sources.{name}: no such setting; expected {', '.join(_SOURCES)}")
         tables.pop("sources", None)
-        recipe = _CalibrationSettings(flat(tables, _ROWS, *(name for name in tables if isinstance(tables[name], dict))))
-        files = required(recipe["runs.files"], "runs.files", "name a run file of each acquisition")
+        recipe = _CalibrationSettings(
+            flat_entries(tables, _ROWS, *(name for name in tables if isinstance(tables[name], dict)))
+        )
+        files = require_value(recipe["runs.files"], "runs.files", "name a run file of each acquisition")
         runs = [read_run(folder / name) for name in files]
         workbook = recipe["system.file"]
         system = runs[0].system if workbook is None else read_system(folder / workbook)

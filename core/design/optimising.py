@@ -18,7 +18,7 @@ from ..recording import recorded_warnings
 from .parameters import FreeParameters
 from .penalties import faults
 from .recipe import DesignRecipe, read_design_recipe
-from .solvers import scipy_module
+from .solvers import SOLVERS, scipy_module
 
 StepHook = Callable[[PinholeSystem, float], None]
 """Callback ``callback(system, objective)`` after each step, with the best scanner so far and the step's objective."""
@@ -196,8 +196,9 @@ class _Search:
                 self._callback(self._free.build(self._best_parameters()), -value)
             self._tell_progress(number)
 
-        options, bounds = {"maxiter": steps, "ftol": 1e-10, "gtol": 1e-7}, [(0.0, 1.0)] * len(x0)
-        self._minimize(evaluate, x0, jac=True, method="L-BFGS-B", bounds=bounds, callback=record, options=options)
+        solver = SOLVERS[self._recipe.choice("search.solver", SOLVERS)]
+        options, bounds = {"maxiter": steps, **solver.options}, [(0.0, 1.0)] * len(x0)
+        self._minimize(evaluate, x0, jac=True, method=solver.name, bounds=bounds, callback=record, options=options)
 
     def _draw_start(self, number: int) -> Floats:
         """Return the x from which search `number` starts: the recipe's for the first, else a random one with a scanner."""

@@ -10,22 +10,25 @@ from typing import Any
 
 from ..arrays import Array
 from ..errors import InputError, naming
-from ..events.entries import by_key, check_entries, flat, like, required, table
 from ..files import read_bytes
 from ..geometry.grid import Grid
 from ..geometry.system import PinholeSystem, chosen_modules
 from ..phantoms.language import parse_phantom, read_phantom
 from ..phantoms.phantom import ShapePhantom
 from ..projector import Emission, Projector
-from ..runs.recipe import Recipe, Values
+from ..recipes.settings import Setting, choice_setting, settings_by_key, table_names, word_labels
+from ..recipes.tables import check_entries, read_table, require_value, table_entries
+from ..recipes.toml import read_toml
+from ..recipes.values import Values
+from ..runs.recipe import Recipe
 from ..runs.run_recipe import recipe_model
-from ..runs.settings import Setting, named
-from ..toml import read_toml
+from ..runs.settings import SETTINGS
 from ..validation import one_of
 from ..workbook import read_system
 from .objectives import Detail, Lesion, Regions, Sensitivity, ball_points
 from .parameters import FreeParameters, displacement_parameters, free_parameters
 from .penalties import Clearance, Constraint, CrystalArea, FieldOfView, LineOfSight, ModuleSeparation, SmallestHole
+from .solvers import SOLVERS
 
 VERSION = 1
 TEMPLATE = Path(__file__).parent / "templates" / "design.toml"
@@ -41,14 +44,14 @@ _BODIES = (
 _OBJECTIVES: Mapping[str, tuple[Setting, ...]] = {
     "sensitivity": (Setting("resolution", float, None, "Resolution of the image", unit="mm", above=0), *_POINTS),
     "detail": (Setting("size", float, None, "Size of rods or stripes", unit="mm", above=0), *_POINTS,
-               Setting("hole", str, "disc", "Shape of the hole's blur", words=named(("disc", "gaussian")))),
+               Setting("hole", str, "disc", "Shape of the hole's blur", words=word_labels(("disc", "gaussian")))),
     "lesion": _BODIES,
     "regions": _BODIES,
 }  # fmt: skip
 """Settings of each kind of objective."""
 _OPTICS = "time isotope window energy_fwhm aperture_mu opening_angle_degrees crystal_mu intrinsic_fwhm background"
-_ROWS = by_key((
-    *(like(f"model.{name}", f"model.{name}") for name in _OPTICS.split()),
+_ROWS = settings_by_key((
+    *(SETTINGS[f"model.{name}"].with_key(f"model.{name}") for name in _OPTICS.split()),
     Setting("imaging.voxels", int, 32, "Voxels along x, y and z", least=1),
     Setting("imaging.spacing", float, 5.0, "Voxel size", unit="mm", above=0),
     Setting("imaging.pixels", int, 32, "Pixels along each side of a crystal", least=2),
@@ -63,6 +66,7 @@ _ROWS = by_key((
     Setting("search.coarse", int, 2, "Factor of the size of voxels and pixels in the first searches", least=1),
     Setting("search.coarse_steps", int, 15, "Steps from each start", least=1),
     Setting("search.steps", int, 15, "Steps of each of the three rounds that follow, with increasing penalties", least=1),
+    *choice_setting("search.solver", SOLVERS, "Algorithm of the search"),
     Setting("pareto.entry", str, None, "Entry that varies, such as generator.modules or objectives.resolution"),
     Setting("pareto.values", float, (), "Values of this entry", sizes=()),
     Setting("pareto.x", str, "resolution", "Column of the table for the plot's horizontal axis"),
@@ -74,7 +78,7 @@ _ROWS = by_key((
     Setting("evaluation.subsets", int, None, "Subsets of OSEM", "as many as suit", least=1),
     Setting("evaluation.seed", int, 0, "Seed of the noise", least=0),
 ))  # fmt: skip
-_TABLES = tuple(dict.fromkeys(key.partition(".")[0] for key in _ROWS))
+_TABLES = table_names(_ROWS)
 
 
 class ObjectiveSettings(Values):
@@ -85,13 +89,15 @@ class ObjectiveSettings(Values):
         """Settings of this kind of objective, by key."""
         one_of(self.given.get("kind"), _OBJECTIVES, "kind")
         weight = Setting("weight", float, 1.0, "Weight, each objective being 1 at the start", above=0)
-        return by_key((Setting("kind", str, None, "Kind of objective"), weight, *_OBJECTIVES[self.given["kind"]]))
+        return settings_by_key(
+            (Setting("kind", str, None, "Kind of objective"), weight, *_OBJECTIVES[self.given["kind"]])
+        )
 
     def __post_init__(self) -> None:
         super().__post_init__()
         for key in ("resolution", "size", "body", "parts"):
             if key in self.rows:
-                required(self[key], key, f"expected {self.rows[key].text}")
+                require_value(self[key], key, f"expected {self.rows[key].text}")
 
 
 @dataclass(frozen=True)
@@ -134,7 +140,7 @@ class DesignRecipe(Values):
         values = dict(self.generator)
         kind = values.pop("kind", "ellipse")
         if kind == "workbook":
-            file = required(values.pop("file", None), "generator.file", "name the workbook")
+            file = require_value(values.pop("file", None), "generator.file", "name the workbook")
             system = chosen_modules(read_system(self.folder / file), values.pop("modules", None), "generator.modules")
             values = displacement_parameters(system, **values)
         return free_parameters(kind, values, self.free)
@@ -213,11 +219,9 @@ class DesignRecipe(Values):
 
 def design_recipe(values: Mapping[str, Any], folder: Path = Path()) -> DesignRecipe:
     """Return the recipe of a design from nested tables, as TOML has them; paths in it are relative to `folder`."""
-    entries, tables = dict(values), {name: table(values, name) for name in ("generator", "free")}
+    tables = {name: read_table(values, name) for name in ("generator", "free")}
     check_entries(values, VERSION, ("version", *tables, "objectives", *_TABLES))
-    objectives = entries.pop("objectives", [])
-    settings = {name: value for name, value in entries.items() if name not in ("version", *tables)}
-    return DesignRecipe(flat(settings, _ROWS, *_TABLES), **tables, objectives=objectives, folder=folder)
+    return DesignRecipe(table_entries(values, _ROWS), **tables, objectives=values.get("objectives", []), folder=folder)
 
 
 def read_design_recipe(path: str | os.PathLike[str]) -> DesignRecipe:

@@ -11,9 +11,8 @@ from ..errors import InputError
 from ..figures.page import LARGEST, Page, box
 from ..figures.parts import number
 from ..runs import letters
-from ..runs.display import Display, unit_text
-from ..runs.mosaic import COLUMNS, as_seen, places
-from ..runs.resizing import resized
+from ..runs.display import Display, resize_picture, unit_text
+from ..runs.mosaic import COLUMNS, as_seen, tile_places
 from ..volumes.volume import Volume
 from .event_set import Event
 
@@ -206,7 +205,7 @@ def _mosaic_panel(row: SheetRow, images: Floats32, rings: Integers, fraction: fl
 
     def mosaic_size(columns: int) -> tuple[float, int, int]:
         """Return the width of a mosaic of height 1, and its numbers of tiles down and across."""
-        positions = places(rings, columns)
+        positions = tile_places(rings, columns)
         n_down, n_across = int(positions[:, 0].max()) + 1, int(positions[:, 1].max()) + 1
         tile = _SIDE / n_down / n_v  # page pixels per image pixel
         return n_across * n_u * tile / _SIDE, n_down, n_across
@@ -220,10 +219,10 @@ def _mosaic_panel(row: SheetRow, images: Floats32, rings: Integers, fraction: fl
     wide = max(1, min(round(tall * n_u / n_v), int(_WIDEST * _SIDE) // n_across))
     window = 0.0, _upper_limit(images)
     display = Display("inferno")
-    tiles = display.colored(resized(as_seen(images).transpose(1, 2, 0), tall, wide), window)
+    tiles = display.colored(resize_picture(as_seen(images).transpose(1, 2, 0), tall, wide), window)
     sheet = np.empty((n_down * (tall + 2) - 2, n_across * (wide + 2) - 2, 3), np.uint8)
     sheet[:] = list(bytes.fromhex(_PAPER.removeprefix("#")))
-    for m, (tile_row, tile_column) in enumerate(places(rings, columns)):
+    for m, (tile_row, tile_column) in enumerate(tile_places(rings, columns)):
         top, left = tile_row * (tall + 2), tile_column * (wide + 2)
         sheet[top : top + tall, left : left + wide] = tiles[:, :, m]
     size = sheet.shape[1], sheet.shape[0]

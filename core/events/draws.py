@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 
 from ..errors import InputError
-from ..runs.recipe import Values
-from ..runs.settings import Setting
+from ..recipes.settings import Setting
+from ..recipes.values import Values
 
 _NORMAL = statistics.NormalDist()
 
@@ -78,8 +78,9 @@ class DrawnSetting(Setting):
             return super().checked(value)
         return self._checked_choice(value) if "one_of" in value else self._checked_range(value)
 
-    def _one(self, value: Any) -> Any:
-        return replace(self, sizes=None).checked(value) if isinstance(value, Mapping) else super()._one(value)
+    def checked_one(self, value: Any) -> Any:
+        """Return one value, or a draw of one, as a recipe keeps it; raise `InputError` if it is not allowed."""
+        return replace(self, sizes=None).checked(value) if isinstance(value, Mapping) else super().checked_one(value)
 
     def _checked_choice(self, value: Mapping[str, Any]) -> Mapping[str, Any]:
         """Return a choice ``{ one_of = […], odds = […] }`` with checked options; `InputError` where it is none."""

@@ -15,12 +15,12 @@ from ..geometry.scanner import Scanner
 from ..geometry.views import Views
 from ..memory import readable_size, require
 from ..progress import Progress, tell
-from ..projector import Emission, Model, Projector
+from ..projector import Model, Projector
 from ..rays.backends import choose
 from ..recording import Remembered, recorded_warnings, remembered
 from ..runs.projecting import Imaging, warn_of_energy
 from ..runs.recipe import Recipe
-from ..runs.run_recipe import mu_of_files, recipe_imaging, recipe_model, recipe_system, recipe_views, require_mu
+from ..runs.run_recipe import read_attenuation, recipe_imaging, recipe_model, recipe_system, recipe_views, require_mu
 from ..validation import freeze
 from ..volumes.rearranging import centered
 from ..volumes.resampling import resample
@@ -155,7 +155,7 @@ class EventMaker:
             self._check_mu(planned, imaging.model)
             mu = self._voxelize(planned, "mu").array
         images = imaging.images(truth, mu)
-        if isinstance(imaging.model, Emission) and self.recipe["augmentation.module_gain"]:
+        if imaging.model.has_times and self.recipe["augmentation.module_gain"]:
             images *= gains.astype(np.float32)[:, None, None]
         return images, imaging.unit(truth)
 
@@ -178,7 +178,7 @@ class EventMaker:
     def _make_imaging(self, recipe: Recipe) -> Imaging:
         """Return the image simulator of a model's recipe on the grid of the truth."""
         grid, placed = self.recipe.grid, self.recipe.placed(recipe)
-        mu = mu_of_files(recipe, recipe_model(placed, self.system), lambda file: self.recipe.input(file).volume())
+        mu = read_attenuation(recipe, recipe_model(placed, self.system), lambda file: self.recipe.input(file).volume())
         if recipe["attenuation.of_phantom"]:  # a placeholder for the grid: each event has its own mu
             mu = Volume(freeze(np.zeros(grid.shape, np.float32)), grid, "mu")
         return recipe_imaging(placed, self.system, self.views, grid, mu, threads=self.threads)

@@ -18,8 +18,8 @@ from ..files import AnyPath
 from ..geometry.scanner import Scanner
 from ..geometry.views import Views
 from ..physics.isotopes import isotope
-from ..physics.noise import draw_counts
-from ..runs.counting import live_shares_of, scaled
+from ..physics.noise import NOISE_MODELS
+from ..runs.counting import recorded_shares, scale_by_module
 from ..runs.projecting import LINES
 from ..runs.recipe import Recipe, recorded_recipe
 from ..runs.run import ProjectionRun
@@ -211,7 +211,8 @@ class Event:
         if level != 1.0:
             images *= np.float32(level)
         if noise_seed is not None:
-            draw_counts(images, noise_seed, images)
+            noise = self.recipe.settings.choice("noise.model", NOISE_MODELS)
+            NOISE_MODELS[noise].draw(images, noise_seed, images)
         return images if region else images[modules]
 
     def radon(self, count: int) -> Floats32:
@@ -241,7 +242,7 @@ class Event:
             settings["recipe"] = record.tables()
         image_model: Any = recipe_model(self._folder.recipe.placed(recipe), self.system)
         images = self.images(model, noise_seed, level)
-        background = scaled(image_model.background, live_shares_of(recipe, images))
+        background = scale_by_module(image_model.background, recorded_shares(recipe, images))
         return ProjectionRun(
             images, self.system, self.views, self.truth, unit=self.unit(model), settings=settings, seed=noise_seed,
             background=background, efficiency=image_model.efficiency,

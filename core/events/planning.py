@@ -31,6 +31,8 @@ _GOLDEN = (math.sqrt(5) - 1) / 2
 class PlannedEvent:
     """Drawn parameters of event `number`, from 0, of a recipe; images and truth are not computed.
 
+    The attributes ``size`` and ``activity_factor`` are the factors, float, of the phantom's lengths and of all values.
+
     Attributes
     ----------
     entry : PhantomEntry
@@ -45,8 +47,6 @@ class PlannedEvent:
         Position of the phantom's centre, mm, and its angles phi, theta, psi, degrees.
     mirror : bool
         Whether the phantom is mirrored.
-    size, activity_factor : float
-        Factors of the phantom's lengths and of all values.
     noise_seed : int
         Seed of the event's own noise.
     """

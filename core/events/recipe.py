@@ -15,23 +15,14 @@ import numpy as np
 from ..errors import InputError, naming
 from ..files import AnyPath
 from ..geometry.grid import Grid
+from ..physics.noise import NOISE_MODELS
+from ..recipes.settings import Setting, choice_setting, settings_by_key, table_names, word_labels
+from ..recipes.tables import check_entries, flat_entries, read_table, require_name, require_value, table_entries
+from ..recipes.toml import parse_toml, toml_text
 from ..runs.recipe import Recipe
-from ..runs.settings import Setting, named
-from ..toml import parse_toml, toml_text
+from ..runs.settings import SETTINGS
 from .draws import DrawnSetting, DrawnValues, check_odds
-from .entries import (
-    PhantomEntry,
-    by_key,
-    check_entries,
-    flat,
-    grid_of,
-    is_shape_file,
-    like,
-    phantom_entry,
-    plain_name,
-    required,
-    table,
-)
+from .entries import PhantomEntry, is_shape_file, phantom_entry
 from .inputs import Input, original_input
 
 VERSION = 1
@@ -42,30 +33,32 @@ _RESERVED = (
 )
 """Names of the other arrays and entries in exports and training batches, which no model may have."""
 
-_ROWS = by_key((
-    like("truth.voxels", "phantom.voxels"),
-    like("truth.spacing", "phantom.spacing"),
-    like("truth.center", "phantom.position", text="Centre of the truth, x y z"),
-    Setting("truth.quantity", str, "activity", "Quantity of the truth", words=named(("activity", "mu"))),
+_ROWS = settings_by_key((
+    SETTINGS["phantom.voxels"].with_key("truth.voxels"),
+    SETTINGS["phantom.spacing"].with_key("truth.spacing"),
+    SETTINGS["phantom.position"].with_key("truth.center", text="Centre of the truth, x y z"),
+    Setting("truth.quantity", str, "activity", "Quantity of the truth", words=word_labels(("activity", "mu"))),
     Setting("truth.store", str, "float32", "How the truth is stored, sparse without voxels that are 0",
-            words=named(("float32", "float16", "sparse"))),
+            words=word_labels(("float32", "float16", "sparse"))),
     Setting("truth.below", float, 0.0, "Fraction of the truth's maximum below which values are stored as 0",
             least=0, most=1, needs=("truth.store=sparse",)),
     Setting("radon.angles", int, None, "Numbers of angles, one for each set of parallel projections", least=1, sizes=()),
     Setting("radon.over_degrees", float, 180.0, "Range that the angles cover", unit="degrees", above=0, most=360),
     Setting("radon.rows", int, None, "Pixel rows", "one for each of the truth's voxels along z", least=1),
     Setting("radon.columns", int, None, "Pixel columns", "one for each of the truth's voxels along x or y", least=1),
-    like("radon.pitch", "phantom.spacing", text="Pixel size, one or along u and v", absent="the voxels'", sizes=(1, 2)),
+    SETTINGS["phantom.spacing"].with_key("radon.pitch", text="Pixel size, one or along u and v", absent="the voxels'",
+                                         sizes=(1, 2)),
     Setting("augmentation.mirror", float, 0.0, "Probability of mirroring the phantom along its x axis", least=0, most=1),
     DrawnSetting("augmentation.size", float, 1.0, "Factor of the phantom's lengths", above=0),
     DrawnSetting("augmentation.activity", float, 1.0, "Factor of all values", above=0, needs=("truth.quantity=activity",)),
     Setting("augmentation.module_gain", float, 0.0, "Relative standard deviation of the modules' sensitivities", least=0,
             most=math.nextafter(1, 0)),
     Setting("noise.levels", float, (1.0,), "Fractions of the acquisition time at which noise is drawn", above=0, sizes=()),
-    Setting("storage.images", str, "float32", "How images are stored", words=named(("float32", "float16"))),
+    *choice_setting("noise.model", NOISE_MODELS, "How counts vary around their means"),
+    Setting("storage.images", str, "float32", "How images are stored", words=word_labels(("float32", "float16"))),
 ))  # fmt: skip
-_SEED = like("seed", "noise.seed", default=0, text="Seed of all random numbers")
-_TABLES = ("truth", "radon", "augmentation", "noise", "storage")
+_SEED = SETTINGS["noise.seed"].with_key("seed", default=0, text="Seed of all random numbers")
+_TABLES = table_names(_ROWS)
 _ENTRIES = ("version", "seed", "system", "detector", "phantoms", "models", "splits", *_TABLES)
 
 
@@ -129,7 +122,7 @@ class EventRecipe:
     @cached_property
     def settings(self) -> DrawnValues:
         """The values of the settings in the tables `_TABLES`."""
-        return _Settings(flat({name: table(self.values, name) for name in _TABLES}, _ROWS, *_TABLES))
+        return _Settings(table_entries(self.values, _ROWS))
 
     @cached_property
     def seed(self) -> int:
@@ -139,9 +132,9 @@ class EventRecipe:
     @cached_property
     def system(self) -> Recipe:
         """The tables [system] and [detector] as a recipe of projection runs."""
-        tables = {name: table(self.values, name) for name in ("system", "detector")}
-        recipe = Recipe(flat(tables, {}, *tables))
-        required(recipe["system.file"], "system.file", "name the geometry workbook")
+        tables = {name: read_table(self.values, name) for name in ("system", "detector")}
+        recipe = Recipe(flat_entries(tables, {}, *tables))
+        require_value(recipe["system.file"], "system.file", "name the geometry workbook")
         return recipe
 
     @property
@@ -152,7 +145,7 @@ class EventRecipe:
     @cached_property
     def grid(self) -> Grid:
         """The voxel grid of the truth."""
-        return grid_of(self, "truth")
+        return self.settings.table_grid("truth")
 
     @cached_property
     def phantoms(self) -> tuple[PhantomEntry, ...]:
@@ -174,13 +167,13 @@ class EventRecipe:
     @cached_property
     def models(self) -> dict[str, Recipe]:
         """The image models by name, each as a recipe of projection runs."""
-        tables = table(self.values, "models")
+        tables = read_table(self.values, "models")
         models = {}
         for name, entries in tables.items():
             with naming(f"models.{name}"):
                 if not isinstance(entries, dict):
                     raise InputError(f"expected a table [models.{name}]")
-                plain_name(name, "model")
+                require_name(name, "model")
                 if name in _RESERVED or name.startswith("radon"):
                     raise InputError(f"a reserved name: expected another than {', '.join(_RESERVED)} or radon…")
                 models[name] = self._model_recipe(dict(entries))
@@ -196,7 +189,7 @@ class EventRecipe:
         """The parallel projections of the truth; None without a table [radon]."""
         if "radon" not in self.values:
             return None
-        counts = required(self["radon.angles"], "radon.angles", "give numbers of angles, such as [96, 256]")
+        counts = require_value(self["radon.angles"], "radon.angles", "give numbers of angles, such as [96, 256]")
         if len(set(counts)) < len(counts):
             raise InputError(f"radon.angles: expected different numbers of angles, such as [96, 256], got {counts}")
         (n_x, n_y, n_z), (d_x, d_y, d_z) = self.grid.shape, self.grid.spacing.tolist()
@@ -212,11 +205,11 @@ class EventRecipe:
     @cached_property
     def splits(self) -> dict[str, float]:
         """The fractions of the events in each split, by name, which sum to 1; empty without a table [splits]."""
-        splits = table(self.values, "splits")
+        splits = read_table(self.values, "splits")
         if splits:
             check_odds(list(splits.values()), len(splits), "splits")
             for name in splits:
-                plain_name(name, "splits")
+                require_name(name, "splits")
         total = math.fsum(splits.values())
         if splits and abs(total - 1) > 1e-6 and not self.inputs:  # a set begun by an earlier version keeps its recipe
             raise InputError(f"splits: expected shares that sum to 1, got {total:.9g}")

@@ -6,7 +6,7 @@ from types import MappingProxyType
 
 from ..example import EXAMPLE
 from ..files import AnyPath
-from ..toml import toml_value
+from ..recipes.toml import toml_value
 from ..validation import one_of
 
 _FOLDER = Path(__file__).with_name("templates")

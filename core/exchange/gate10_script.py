@@ -21,7 +21,7 @@ FOLDER = Path(__file__).resolve().parent
 
 
 def build(data: dict[str, Any], threads: int = 1) -> Any:
-    """The simulation described by `data`."""
+    """Return the simulation described by `data`."""
     import opengate
 
     units = opengate.g4_units
@@ -80,7 +80,7 @@ def add_volume(simulation: Any, units: Any, part: dict[str, Any]) -> None:
 
 
 def activity_for_each_thread(opengate: Any, threads: int) -> float:
-    """The share of the activity to give to a source so that all threads together emit all of it.
+    """Return the share of the activity to give to a source so that all threads together emit all of it.
 
     In opengate 10.0 to 10.1.1 every thread emits the whole activity of its source; later ones divide it among the threads.
     The version number does not distinguish them, so a trial source shows what it hands to a thread.
@@ -174,7 +174,7 @@ def check_emitted(data: dict[str, Any], emitted: int) -> None:
 
 
 def images(data: dict[str, Any], positions: NDArray[np.float64]) -> NDArray[np.uint32]:
-    """Images (modules, rows, columns) of singles at world `positions` (N, 3), mm, in any crystal."""
+    """Return images (modules, rows, columns) of singles at world `positions` (N, 3), mm, in any crystal."""
     rows, columns = data["image_shape"]
     made = np.zeros((len(data["modules"]), rows, columns), np.uint32)
     for image, module in zip(made, data["modules"], strict=True):
@@ -188,7 +188,7 @@ def images(data: dict[str, Any], positions: NDArray[np.float64]) -> NDArray[np.u
 
 
 def read_positions(data: dict[str, Any]) -> NDArray[np.float64]:
-    """World positions (N, 3), mm, of all singles in the energy window."""
+    """Return the world positions (N, 3), mm, of all singles in the energy window."""
     import uproot
 
     found = [np.zeros((0, 3))]

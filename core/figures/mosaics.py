@@ -6,8 +6,8 @@ from functools import partial
 import numpy as np
 
 from ..runs import letters
-from ..runs.mosaic import as_seen, places
-from ..runs.resizing import resized
+from ..runs.display import resize_picture
+from ..runs.mosaic import as_seen, tile_places
 from .page import Page, box
 from .parts import INK, bar_width, color_bar, heading
 from .subject import FigureSubject
@@ -24,8 +24,8 @@ def _draw(page: Page, subject: FigureSubject, wide: bool) -> None:
     images = replace(subject.display, half=not wide).part(images)
     rows, columns = images.shape[1:]
     contents = "Wide FOV: whole images" if wide else "FOV: the central half of each image"
-    of_volume = f" of {subject.name}" if subject.name else ""
-    top = heading(page, f"Projections{of_volume}", [f"{contents}, {rows} × {columns} pixels"])
+    suffix = f" of {subject.name}" if subject.name else ""
+    top = heading(page, f"Projections{suffix}", [f"{contents}, {rows} × {columns} pixels"])
     window = subject.display.window(images)
     colors_width = bar_width(page, subject.display, window, run.unit)
     rings = system.rings()
@@ -36,19 +36,19 @@ def _draw(page: Page, subject: FigureSubject, wide: bool) -> None:
 
     def scale(per_row: int) -> float:
         """Return the page's pixels per image pixel if rows hold `per_row` images."""
-        n_rows = int(places(rings, per_row)[:, 0].max()) + 1
+        n_rows = int(tile_places(rings, per_row)[:, 0].max()) + 1
         return min((width / per_row - gap) / columns, (height / n_rows - gap) / rows)
 
     longest = int(np.bincount(rings).max())
     per_row = max(sorted({-(-longest // n_parts) for n_parts in range(1, longest + 1)}, reverse=True), key=scale)
-    cells = places(rings, per_row)
+    cells = tile_places(rings, per_row)
     tile = max(1, int(rows * scale(per_row))), max(1, int(columns * scale(per_row)))
     corners = cells * (np.array(tile) + gap)
     extent = corners.max(axis=0) + tile
     left += max(0, (width - int(extent[1])) // 2)
     top += max(0, (height - int(extent[0])) // 2)
     sheet = np.full((*extent, 3), 255, np.uint8)
-    pictures = subject.display.colored(resized(as_seen(images).transpose(1, 2, 0), *tile), window)
+    pictures = subject.display.colored(resize_picture(as_seen(images).transpose(1, 2, 0), *tile), window)
     for m, (row, column) in enumerate(corners):
         sheet[row : row + tile[0], column : column + tile[1]] = pictures[:, :, m]
     page.image(sheet, left, top, int(extent[1]), int(extent[0]))
@@ -64,4 +64,6 @@ def _draw(page: Page, subject: FigureSubject, wide: bool) -> None:
 
 
 draw_fov = partial(_draw, wide=False)
+"""Function that draws the central half of each projection, ``draw_fov(page, subject)``."""
 draw_wide_fov = partial(_draw, wide=True)
+"""Function that draws the whole projections, ``draw_wide_fov(page, subject)``."""

@@ -12,8 +12,8 @@ from ..arrays import Array, ArrayLike, Bytes, Floats, Floats32
 from ..errors import InputError
 from ..files import AnyPath, require_ending, write_bytes
 from ..runs import letters
-from ..runs.mosaic import png, write_png
-from ..runs.resizing import resized
+from ..runs.display import resize_picture
+from ..runs.mosaic import png_bytes, write_png
 
 SUFFIXES = (".png", ".svg")
 SMALLEST, LARGEST = 120, 16384
@@ -55,9 +55,9 @@ class Page:
         """Put a picture (h, w, 3) into a rectangle; enlarged pixels stay squares."""
         rows, columns = max(1, height), max(1, width)
         self._pixels[top : top + rows, left : left + columns] = (
-            picture if picture.shape[:2] == (rows, columns) else resized(picture, rows, columns)
+            picture if picture.shape[:2] == (rows, columns) else resize_picture(picture, rows, columns)
         )
-        encoded = base64.b64encode(png(picture)).decode()
+        encoded = base64.b64encode(png_bytes(picture)).decode()
         style = ' style="image-rendering:pixelated"' if picture.shape[1] < columns else ""
         self._marks.append(
             f'<image x="{left}" y="{top}" width="{columns}" height="{rows}" preserveAspectRatio="none"{style} '
@@ -97,7 +97,7 @@ class Page:
         upward: bool = False,
     ) -> None:
         """Write a line of text that starts, is centred or ends at (x, y) on its baseline; `upward` turns it by 90°."""
-        coverage, baseline = letters.lettered(text, size)
+        coverage, baseline = letters.text_ink(text, size)
         offset = _STARTS[anchor] * coverage.shape[1]
         if upward:
             coverage, left, top = np.rot90(coverage), x - baseline, y - coverage.shape[1] + offset

@@ -24,7 +24,7 @@ _CURVE = "#e0604a"
 # Slices are cut to values above this share of the last colour's, with a margin of this share of the volume's sides.
 _VISIBLE, _MARGIN = 0.05, 0.06
 _TEXT_WIDTH = 25.0  # width of the text beside the slices, in units of the text's size
-_LEGIBLE = 11.0  # least larger side of a slice if two or three of each volume are drawn, in units of the text's size
+_LEGIBLE = 11.0  # smallest longer side of a slice if two or three of each volume are drawn, in units of the text's size
 
 
 def draw(
@@ -115,7 +115,7 @@ def _draw_texts(
     def write(text: str, size: float, color: str) -> None:
         """Write a text, wrapped to the column's width, below the last row."""
         nonlocal row
-        for line in letters.wrapped(text, lambda piece: letters.width(piece, size) <= width):
+        for line in letters.wrap_text(text, lambda piece: letters.width(piece, size) <= width):
             row += 1.35 * size
             page.text(line, left, row, size, color)
 

@@ -17,6 +17,7 @@ touches nothing. Any other way to that face leads through the plate or a wall.
 """
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal, get_args
 
@@ -128,6 +129,18 @@ class Collimator:
         rim = self.hole_radius(self.construction.back)
         return rim + _SHOULDER * (self.detector_side / 2 - rim)
 
+    @property
+    def rings(self) -> list[tuple[Literal["circle", "square"], float, float]]:
+        """Outline, half-width and depth, mm, of the rings of the surface: along the hole, the channel, and back outside."""
+        construction, half_side = self.construction, self.detector_side / 2
+        return [
+            *(("circle", radius, depth) for depth, radius in self.hole_profile),  # type: ignore[list-item]
+            ("square", self.channel_half_width, construction.back),
+            ("square", half_side, self.length),
+            ("square", half_side + construction.wall_thickness, self.length),
+            ("square", self.front_half_width, construction.front),
+        ]
+
     def open_share(self, slope: float) -> float:
         """Return the fraction of the hole's area that is open to parallel rays of the `slope` tan(angle to the axis) >= 0.
 
@@ -143,3 +156,7 @@ class Collimator:
         # The steps are even in an angle, because the chords' lengths behave like a square root at the disc's rim.
         steps = self.diameter / 2 * np.cos((np.arange(n) + 0.5) / n * np.pi / 2) * (np.pi / 2 / n)
         return float(2 * (np.maximum(high - low, 0.0) * steps).sum() / (np.pi / 4 * self.diameter**2))
+
+
+COLLIMATORS: Mapping[str, type[Collimator]] = {"square": Collimator}
+"""Classes of collimators by the shape of their channel and outside; `PinholeSystem.collimators` makes them."""

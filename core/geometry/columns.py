@@ -179,7 +179,7 @@ class Column:
         """Return `values`, one for each of `n` modules or one for all, as an array (M,) of the column's kind.
 
         For a coordinate, `values` are those of all three: (M, 3), or one triple for all modules. If `n` is None, the values
-        of a coordinate set the number of modules. Raises `InputError` if the values are not valid.
+        set the number of modules. Raises `InputError` if the values are not valid.
         """
         if self.axis is not None:
             vectors = real_numbers(values, self.field)
@@ -187,10 +187,10 @@ class Column:
                 vectors = np.broadcast_to(vectors, (n, 3))
             return real_array(vectors, self.field, (n, 3))
         if self.is_text:
-            return self._texts(values, n or 1)
+            return self._texts(values, n or max(1, np.size(values)))
         if self.kind == "angle":
             radians(values, self.field, None)
-        numbers = one_for_all(values, self.field, n or 1)
+        numbers = one_for_all(values, self.field, n or max(1, np.size(values)))
         if self.kind == "whole":
             integers = numbers.astype(np.int64)
             if not np.array_equal(integers, numbers):

@@ -26,6 +26,7 @@ _N = 64
 _ANGLE = 2 * np.pi * np.arange(_N) / _N
 _CIRCLE = np.stack([np.cos(_ANGLE), np.sin(_ANGLE)], axis=1)
 _SQUARE = _CIRCLE / np.abs(_CIRCLE).max(axis=1, keepdims=True)  # half-width 1, at the same angles
+_OUTLINES = {"circle": _CIRCLE, "square": _SQUARE}
 
 
 _FACES = [[0, 3, 2, 1], [4, 5, 6, 7], [0, 1, 5, 4], [1, 2, 6, 5], [2, 3, 7, 6], [3, 0, 4, 7]]
@@ -60,17 +61,10 @@ def collimator_solid(collimator: Collimator) -> Solid:
     Rings of points run along the hole from the plate's front to its back, along the channel to the crystal, and along the
     outside back to the front; quads join each ring to the next and the last to the first.
     """
-    construction, l = collimator.construction, collimator.length
-    rings = (
-        *((_CIRCLE, radius, depth) for depth, radius in collimator.hole_profile),
-        (_SQUARE, collimator.channel_half_width, construction.back),
-        (_SQUARE, collimator.detector_side / 2, l),
-        (_SQUARE, collimator.detector_side / 2 + construction.wall_thickness, l),
-        (_SQUARE, collimator.front_half_width, construction.front),
-    )
+    rings = collimator.rings
     vertices = np.empty((len(rings), _N, 3))
-    for ring, (points, size, depth) in zip(vertices, rings, strict=True):
-        ring[:, :2], ring[:, 2] = points * size, depth
+    for ring, (outline, half_width, depth) in zip(vertices, rings, strict=True):
+        ring[:, :2], ring[:, 2] = _OUTLINES[outline] * half_width, depth
     return vertices.reshape(-1, 3), _ring_faces(len(rings))
 
 

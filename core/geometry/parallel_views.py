@@ -30,7 +30,7 @@ def parallel_views(
         Numbers of pixels (n_v, n_u) of each image.
     pitch
         Pitch of the pixels, mm: one number, or (pitch_u, pitch_v).
-    elevation : number or array (M,)
+    elevation : float or array (M,)
         Elevations theta of the sources over the plane z = 0, rad, from -pi/2 to pi/2.
     center
         World point (3,), mm, in the middle of all images.

@@ -21,7 +21,6 @@ from ..errors import InputError
 from ..system_source import SystemSource
 from ..validation import freeze, real_array
 from .columns import ColumnTable, Values
-from .finding import Finding
 from .module_parts import ModulePart
 from .views import Views
 
@@ -34,6 +33,20 @@ SCANNERS: dict[str, type[Scanner]] = {}
 """Classes of the kinds of scanners by name; a class enters itself when it is defined."""
 
 _signature = lru_cache(signature)  # cached, because `signature` is slow
+
+
+class Finding:
+    """Something wrong with one module or with a pair of modules; ``str`` gives it in one line."""
+
+    message: ClassVar[str]
+
+    def __str__(self) -> str:
+        return self.message.format(self)
+
+    @property
+    def modules(self) -> tuple[int, ...]:
+        """Numbers of the modules concerned."""
+        return tuple(getattr(self, name) for name in ("first", "second", "module", "by") if hasattr(self, name))
 
 
 class Scanner(ABC):
@@ -225,6 +238,14 @@ class Scanner(ABC):
     def rings(self) -> Integers:
         """Return the index (M,) of each module's ring, from 0; by default all modules are in one."""
         return np.zeros(len(self), dtype=np.int64)
+
+    def roi_radii(self) -> Floats:
+        """Return the radii (M,), mm, of the modules' regions of interest; by default all are `region_radius`."""
+        return np.full(len(self), self.region_radius())
+
+    def derived_lengths(self) -> Mapping[str, Floats]:
+        """Return lengths (M,), mm, by name that files hold besides the columns, from which they follow; by default none."""
+        return {}
 
     def region_radius(self) -> float:
         """Return the radius, mm, of the imaged sphere around the isocentre; by default half of the least source distance."""

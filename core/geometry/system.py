@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from ..arrays import Array, ArrayLike, Floats, Integers
 from ..errors import InputError, expecting, naming, warn
 from ..system_source import SystemSource
-from ..validation import lengths, positive, real_array, whole_shape
-from .collimator import Collimator, Construction
+from ..validation import lengths, one_of, positive, real_array, whole_shape
+from .collimator import COLLIMATORS, Collimator, Construction
 from .columns import ColumnTable, Values
 from .design_formulas import roi_radius_seen
 from .frames import affine_matrix, module_frames, module_poses, tilt_frames, tilt_vectors
@@ -141,13 +141,17 @@ class PinholeSystem(Scanner):
         zeros, side = np.zeros(len(self)), self.detector_side
         return np.stack([zeros, zeros, self.collimator_length, side, side], axis=1)
 
-    def collimators(self, construction: Construction | None = None) -> list[Collimator]:
-        """Return the collimator of each module; raise `InputError`, which names the module, if one cannot be built."""
+    def collimators(self, construction: Construction | None = None, shape: str = "square") -> list[Collimator]:
+        """Return the collimator of each module, of a shape in `COLLIMATORS`.
+
+        Raises `InputError`, which names the module, if a collimator cannot be built.
+        """
+        one_of(shape, COLLIMATORS, "shape")
         collimators = []
         sizes = (self.pinhole_diameter, self.collimator_length, self.detector_side)
         for number, d, l, side in zip(self.numbers.tolist(), *(size.tolist() for size in sizes), strict=True):
             with naming(f"module {number}"):
-                collimators.append(Collimator(d, l, side, construction or Construction()))
+                collimators.append(COLLIMATORS[shape](d, l, side, construction or Construction()))
         return collimators
 
     def parts(self, construction: Construction | None = None) -> list[ModulePart]:
@@ -170,6 +174,14 @@ class PinholeSystem(Scanner):
     def region_radius(self) -> float:
         """Return the largest of the modules' ROI radii, mm."""
         return float(self.roi_radius.max())
+
+    def roi_radii(self) -> Floats:
+        """Return the radii (M,), mm, of the modules' regions of interest."""
+        return self.roi_radius
+
+    def derived_lengths(self) -> dict[str, Floats]:
+        """Return the pinhole distances b (M,), mm, by name, for files."""
+        return {"pinhole_distance": self.pinhole_distance}
 
     def rings(self) -> Integers:
         """Return the index (M,) of each module's ring, from 0 along +z; pinholes at about the same z form a ring."""

@@ -23,7 +23,7 @@ from ..events.noise_choice import mixed_seed
 from ..files import ensure_folder, remove_leftovers, write_bytes
 from ..memory import readable_size
 from ..progress import Progress, tell
-from ..runs.reconstructing import flattering, model_of
+from ..runs.reconstructing import inverse_crime_notes, reconstruction_model
 from ..runs.run import ProjectionRun
 from ..runs.run_recipe import projector_of_run
 from ..volumes.resampling import resample
@@ -88,7 +88,7 @@ class Source:
     @cached_property
     def setup(self) -> ScannerSetup:
         """Operators of the scanner, those with which a run by it is reconstructed."""
-        model, threads = model_of(self.run, self.run.recipe), self.recipe["training.threads"]
+        model, threads = reconstruction_model(self.run, self.run.recipe), self.recipe["training.threads"]
         A = projector_of_run(self.run, self.recipe.grid, None, model, threads=threads)
         return ScannerSetup(A, self.recipe["osem.subsets"], self.recipe["osem.after"], self.recipe["network.permuted"])
 
@@ -209,7 +209,9 @@ def prepare_samples(
     InputWarning
         The samples take several gigabytes, or the events' voxels are not fine enough to learn from.
     """
-    for text in flattering(source.run, source.recipe.grid, model_of(source.run, source.run.recipe)):
+    for text in inverse_crime_notes(
+        source.run, source.recipe.grid, reconstruction_model(source.run, source.run.recipe)
+    ):
         warn(text)
     draws = [source.draws(split) for split in splits]
     folder = ensure_folder(parent / f"samples-{source.fingerprint[:16]}")

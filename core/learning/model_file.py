@@ -249,7 +249,7 @@ class TrainedNetwork:
         progress
             Called before and after.
         """
-        data, setup = CountData.of(self.label, A, images, background), self.setup(A)
+        data, setup = CountData.checked(self.label, A, images, background), self.setup(A)
         self._last_setup[:] = [setup]
         doubts = [*self._allowed_differences(setup, allow), *self._count_differences(float(data.counts.sum()))]
         for text in doubts:

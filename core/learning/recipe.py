@@ -5,17 +5,26 @@ import hashlib
 import inspect
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 from ..errors import InputError, naming
-from ..events.entries import by_key, check_entries, flat, grid_of, like, required
 from ..files import AnyPath
 from ..geometry.grid import Grid
-from ..runs.recipe import Values
-from ..runs.settings import Setting, named
-from ..toml import parse_toml, toml_text, toml_value
+from ..recipes.settings import (
+    LibraryAlgorithm,
+    Setting,
+    choice_setting,
+    default_setting,
+    settings_by_key,
+    table_names,
+    word_labels,
+)
+from ..recipes.tables import check_entries, require_value, table_entries
+from ..recipes.toml import parse_toml, toml_text, toml_value
+from ..recipes.values import Values
+from ..runs.settings import SETTINGS
 from ..validation import one_of
 from .networks import NETWORKS
 
@@ -23,7 +32,11 @@ VERSION = 1
 """Version of the recipes' language."""
 _KIND = "after-osem"
 _TEMPLATE = Path(__file__).parent / "templates" / "training.toml"
-_ROWS = by_key((
+OPTIMIZERS: Mapping[str, LibraryAlgorithm] = {
+    "adamw": LibraryAlgorithm("AdamW", "Adam with decoupled weight decay", "AdamW", {"weight_decay": 1e-3}),
+}
+"""Optimisers of `torch.optim` by their names in recipes; a second row makes the choice a setting, ``training.optimizer``."""
+_ROWS = settings_by_key((
     Setting("data.events", str, None, "Folder of the event set to learn from", is_path=True),
     Setting("data.model", str, None, "Model of the set's recipe whose images are used", "the only one of counts"),
     Setting("data.train", str, "train", "Split of the set whose events are used for training"),
@@ -31,9 +44,9 @@ _ROWS = by_key((
     Setting("data.levels", float, None, "Shares of the acquisition time, in turn", "those of the set's recipe", above=0,
             sizes=()),
     Setting("data.draws", int, 1, "Number of noise draws per event", least=1),
-    like("grid.voxels", "reconstruction.voxels", default=(64,), absent=""),
-    like("grid.spacing", "reconstruction.spacing", absent=""),
-    like("grid.center", "reconstruction.center"),
+    SETTINGS["reconstruction.voxels"].with_key("grid.voxels", default=(64,), absent=""),
+    SETTINGS["reconstruction.spacing"].with_key("grid.spacing", absent=""),
+    SETTINGS["reconstruction.center"].with_key("grid.center"),
     Setting("osem.subsets", int, 10, "Number of OSEM subsets", least=1),
     Setting("osem.after", int, (2, 8, 16), "Iterations of OSEM whose volumes the network gets", least=1,
             sizes=()),
@@ -45,16 +58,17 @@ _ROWS = by_key((
     Setting("training.steps", int, 3000, "Number of steps", least=1),
     Setting("training.batch", int, 1, "Scans in each step, on all devices together", least=1),
     Setting("training.rate", float, 1.5e-3, "Largest learning rate", above=0, most=1),
+    *choice_setting("training.optimizer", OPTIMIZERS, "Optimiser of the weights"),
     Setting("training.seed", int, 0, "Seed of weights, order and noise", least=0, most=2**31 - 1),
     Setting("training.precision", str, None, "Precision of the network's computing", "bf16-mixed where the processor "
-            "multiplies such matrices, else 32", words=named(("32", "bf16-mixed", "16-mixed"))),
+            "multiplies such matrices, else 32", words=word_labels(("32", "bf16-mixed", "16-mixed"))),
     Setting("training.threads", int, None, "Processor threads", "all", least=1),
-    Setting("training.accelerator", str, "auto", "Device that computes", words=named(("auto", "cpu", "gpu"))),
+    Setting("training.accelerator", str, "auto", "Device that computes", words=word_labels(("auto", "cpu", "gpu"))),
     Setting("training.devices", int, 1, "GPUs, or CPU processes, on each node", least=1),
     Setting("training.nodes", int, 1, "Machines", least=1),
     Setting("training.strategy", str, "auto", "Lightning's name of how devices share the work, such as ddp"),
 ))  # fmt: skip
-TABLES = tuple(dict.fromkeys(key.partition(".")[0] for key in _ROWS))
+TABLES = table_names(_ROWS)
 
 
 @functools.cache
@@ -68,10 +82,9 @@ def network_settings(kind: str) -> Mapping[str, Setting]:
     for name, argument in inspect.signature(network).parameters.items():
         if argument.kind is argument.KEYWORD_ONLY:
             continue
-        example, sizes = (argument.default[0], ()) if isinstance(argument.default, tuple) else (argument.default, None)
-        least = int(name not in network.may_be_0) if type(example) is int else None
-        settings.append(Setting(f"network.{name}", type(example), argument.default, text, least=least, sizes=sizes))
-    return by_key(settings)
+        row = default_setting(f"network.{name}", argument.default, text)
+        settings.append(replace(row, least=int(name not in network.may_be_0)) if row.kind is int else row)
+    return settings_by_key(settings)
 
 
 @dataclass(frozen=True)
@@ -87,7 +100,7 @@ class TrainingRecipe(Values):
     def __post_init__(self) -> None:
         one_of(_ROWS["network.kind"].checked(self.given.get("network.kind", _KIND)), NETWORKS, "network.kind")
         super().__post_init__()
-        required(self["data.events"], "data.events", "name the folder of an event set")
+        require_value(self["data.events"], "data.events", "name the folder of an event set")
         _ = self.grid
         if list(self["osem.after"]) != sorted(set(self["osem.after"])):
             raise InputError(f"osem.after: expected rising numbers, got {list(self['osem.after'])}")
@@ -108,7 +121,7 @@ class TrainingRecipe(Values):
     @functools.cached_property
     def grid(self) -> Grid:
         """Voxels of the network's volumes."""
-        return grid_of(self, "grid")
+        return self.table_grid("grid")
 
     @property
     def network(self) -> dict[str, Any]:
@@ -132,8 +145,7 @@ def parse_recipe(text: str, name: str = "recipe", folder: Path | None = None) ->
     with naming(name):
         values = parse_toml(text, name)
         check_entries(values, VERSION, ("version", *TABLES))
-        del values["version"]
-        return TrainingRecipe(flat(values, _ROWS, *TABLES), text, folder or Path())
+        return TrainingRecipe(table_entries(values, _ROWS), text, folder or Path())
 
 
 def read_recipe(path: AnyPath) -> TrainingRecipe:

@@ -33,7 +33,7 @@ from .data import Samples, Source, prepare_samples
 from .judging.sets import events_by_recipe, set_fingerprint
 from .model_file import ModelContents, TrainedNetwork, read_model, write_model
 from .networks import NETWORKS
-from .recipe import TrainingRecipe
+from .recipe import OPTIMIZERS, TrainingRecipe
 from .setup import Sample, ScannerSetup
 
 _INTERMEDIATE_WEIGHT = 0.3  # weight in the loss of each estimate before the last
@@ -107,8 +107,9 @@ class NetworkTraining(pl.LightningModule):
         self.curve, self.seconds, self._resumed_at = checkpoint["curve"], checkpoint["spent"], time.monotonic()
 
     def configure_optimizers(self) -> Any:
-        """Return AdamW with a learning rate that rises at first, then falls to 0 as a cosine."""
-        optimizer = torch.optim.AdamW(self.parameters(), lr=self.recipe["training.rate"], weight_decay=1e-3)
+        """Return the recipe's optimiser with a learning rate that rises at first, then falls to 0 as a cosine."""
+        algorithm, rate = OPTIMIZERS[self.recipe.choice("training.optimizer", OPTIMIZERS)], self.recipe["training.rate"]
+        optimizer = getattr(torch.optim, algorithm.name)(self.parameters(), lr=rate, **algorithm.options)
         n_warmup = min(50, 1 + self.steps // 10)
         schedule = torch.optim.lr_scheduler.LambdaLR(
             optimizer, lambda step: min(1, (step + 1) / n_warmup) * (0.5 + 0.5 * math.cos(math.pi * step / self.steps))

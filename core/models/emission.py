@@ -1,16 +1,15 @@
 """The model of SPECT: expected counts of each pixel of a crystal behind a pinhole."""
 
-import functools
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields, replace
-from functools import partial
-from typing import Any, ClassVar, Literal, Self
+from functools import cached_property, partial
+from typing import Any, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import ArrayOrTensor, Floats, is_tensor
+from ..arrays import ArrayOrTensor, Floats, Floats32, is_tensor
 from ..errors import InputError, naming
 from ..geometry.collimator import OPENING_ANGLE
 from ..geometry.grid import Grid
@@ -28,19 +27,16 @@ from ..rays.bundles import Beam
 from ..rays.ray_geometry import Fan, view_rays
 from ..validation import instance, positive, real_array, strict_whole
 from ..volumes.volume import Volume
-from . import coefficient_checks
+from . import emission_warnings
 from .model import Model, checked_background, checked_times, require_views_of
 from .photon_lines import checked_mu, checked_photons, line_models, mu_volumes
-from .pixel_points import TOLERANCE, expected_error, lattices, offsets, points_needed, require_points, shadow_edges
+from .pixel_points import TOLERANCE, lattices, offsets, points_needed, require_points, shadow_edges
 from .wall_penetration import models_with_walls
 
-# A box of this width has the same variance as a Gaussian of sigma 1.
-_BOX_PER_SIGMA = math.sqrt(12)
+_BOX_PER_SIGMA = math.sqrt(12)  # width of a box with the variance of a Gaussian of sigma 1
 
 Hole = Literal["auto", "depth", "rays", "point"]
-
-# Default of `aperture_tolerance`: so close a voxel's image by rays is to that of the whole hole.
-_APERTURE_TOLERANCE = 0.1
+_APERTURE_TOLERANCE = 0.1  # default of `aperture_tolerance`
 
 
 @dataclass(frozen=True, eq=False)
@@ -188,13 +184,11 @@ class Emission(Model):
     plate_thickness: float | None = None
     wall_thickness: float | None = None
 
-    photon_lines: ClassVar[tuple[tuple[float, float], ...]] = ()  # set in each model
-    """Detected photon lines of the isotope: energies, keV, in order, and detected photons per decay."""
-
     name = "emission"
     takes = ("activity",)
     has_times = True
     has_geometry_gradient = True
+    ends_at_detector = False
 
     def __post_init__(self) -> None:
         instance(self.system, PinholeSystem, "emission")
@@ -271,7 +265,7 @@ class Emission(Model):
         """Return the models whose images add up: one per line if lines are apart, those with walls, or the model alone."""
         return (self,) if self.wall_thickness is None and not self.is_apart else self._models
 
-    @functools.cached_property
+    @cached_property
     def _models(self) -> tuple[Model, ...]:
         return line_models(self, self.photon_lines) if self.is_apart else models_with_walls(self)
 
@@ -295,17 +289,33 @@ class Emission(Model):
         isotope: Any = self.isotope
         return self.time if isotope is None else isotope.mean_decay_time(self.time, self.start)
 
+    @property
+    def detected_energies(self) -> tuple[float, float] | None:  # type: ignore[override]
+        """Energy window, keV; None without one."""
+        return self.window
+
+    def coarse(self) -> Self:
+        """Return the model of opaque holes and few rays, with this model's times and efficiencies."""
+        time, efficiency = self.effective_time, self.efficiency
+        return type(self)(self.system, time=time, efficiency=efficiency, pixel_points=1, tolerance=1e9)
+
+    def without_blur(self) -> Self:
+        """Return the model of ideal pinholes and crystals: one ray through the hole's centre for each pixel."""
+        return replace(
+            self, hole="point", aperture_points=None, aperture_tolerance=None, pixel_points=1, depth_layers=1
+        )
+
     def unit(self, volume: Volume) -> str:
         """Return the unit of the images of `volume`."""
         return "counts"
 
-    def of_views(self, indices: NDArray[np.integer]) -> Self:
-        """Return the model of the modules with these indices alone."""
+    def of_views(self, which: NDArray[np.integer]) -> Self:
+        """Return the model of the modules `which` alone, indices from 0."""
         arrays = ((f.name, getattr(self, f.name)) for f in fields(self))
-        chosen = {name: array[indices] for name, array in arrays if isinstance(array, np.ndarray)}
-        model = replace(self, system=self.system[indices], **chosen)
+        chosen = {name: array[which] for name, array in arrays if isinstance(array, np.ndarray)}
+        model = replace(self, system=self.system[which], **chosen)
         if self.parts() != (self,):  # the attenuation of lines is computed once, and neighbours stay neighbours
-            model._set("_models", tuple(part.of_views(indices) for part in self.parts()))
+            model._set("_models", tuple(part.of_views(which) for part in self.parts()))
         return model
 
     def check(self, views: Views) -> None:
@@ -314,12 +324,12 @@ class Emission(Model):
         for name in ("background", "efficiency"):
             checked_background(getattr(self, name), f"emission: {name}", len(views), views.shape)
 
-    @functools.cached_property
+    @cached_property
     def optics(self) -> Optics:
         """Settings of hole, edge, walls, cone, crystal and photons, for `sensitivity`, maps and cameras in torch."""
         return Optics(**{f.name: getattr(self, f.name) for f in fields(Optics)})
 
-    @functools.cached_property
+    @cached_property
     def _frames(self) -> Floats:
         return self.system.frames()
 
@@ -343,7 +353,7 @@ class Emission(Model):
         depth = max(float(((grid.corners() - pinhole) @ k).max()), l)
         n_hole = self.hole_points(views, m, grid)
         openings = self.openings(m, n_hole)
-        n = self._pixel_points(views, m, grid)
+        n = self.pixel_points_needed(views, m, grid)
 
         def weights(points: Floats, opening: Opening, layer: int, rows: slice, columns: slice, shifts: slice) -> Floats:
             points_u, points_v = points[shifts].T[:, :, None, None]
@@ -437,29 +447,22 @@ class Emission(Model):
 
     def caution(self, views: Views, grid: Grid) -> str | None:
         """Return a warning if there are too few rays for the tolerance, or None."""
-        if self._is_by_depth:  # there are no rays
-            return None
-        points = [(self._pixel_points(views, m, grid), self.hole_points(views, m, grid)) for m in range(len(views))]
-        errors = [expected_error(shadow_edges(views, m, grid), *points[m]) for m in range(len(views))]
-        error, module = max(errors), int(np.argmax(errors))
-        if error <= self.tolerance:
-            return None
-        n, voxel = self._pixel_points(views, module, grid), " x ".join(f"{size:.3g}" for size in grid.spacing)
-        percent = "more than 100" if error > 1 else f"up to {100 * error:.2g}"
-        advice = "take smaller pixels, or larger voxels"
-        if self.pixel_points is not None:
-            advice = f"pixel_points=None (--pixel-points auto) takes as many as keep {100 * self.tolerance:g} %"
-        rays = f"{n} point{'s' * (n > 1)} of each pixel"
-        off = f"{percent} % off (in module {self.system.numbers[module]}), those of larger sources less"
-        return f"emission: with {rays} the total counts of a single voxel of {voxel} mm may be {off}; {advice}"
+        return None if self._is_by_depth else emission_warnings.ray_caution(self, views, grid)
 
     def coefficient_warnings(self) -> Iterator[str]:
         """Yield a warning for each attenuation coefficient that looks wrong; with lines apart each text once."""
         parts: Any = self.parts() if self.is_apart else (self,)
-        checks = coefficient_checks.coefficient_warnings
-        yield from dict.fromkeys(text for part in parts for text in checks(part))
+        yield from dict.fromkeys(text for part in parts for text in emission_warnings.coefficient_warnings(part))
 
-    def _pixel_points(self, views: Views, m: int, grid: Grid) -> int:
+    def mu_warnings(self, mu: Floats32) -> Iterator[str]:
+        """Yield a warning if `mu` is much larger than bone's where it attenuates most."""
+        return emission_warnings.mu_warnings(mu, self)
+
+    def image_warnings(self, volume: Volume, views: Views) -> Iterator[str]:
+        """Yield a warning of activity below 0, and of images that reach beyond the crystals."""
+        return emission_warnings.image_warnings(volume, views, self)
+
+    def pixel_points_needed(self, views: Views, m: int, grid: Grid) -> int:
         """Return the number of points of each pixel of view m, for each point of the hole."""
         if self.pixel_points is not None:
             return self.pixel_points

@@ -10,12 +10,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..arrays import ArrayOrTensor, Floats, is_tensor, namespace
+from ..arrays import ArrayOrTensor, Floats, Floats32, is_tensor, namespace
 from ..errors import InputError
 from ..geometry.grid import Grid
 from ..geometry.system import PinholeSystem
 from ..geometry.views import Views
 from ..pinhole_response.pinhole_operator import PinholeOperator
+from ..progress import Progress
 from ..rays.bundles import Beam
 from ..rays.ray_geometry import view_rays
 from ..validation import all_above_0, freeze, none_below_0, positive, real_array, shape_text
@@ -53,6 +54,21 @@ class Model(ABC):
     has_times: bool = False
     """Whether images are counts of an acquisition; a dataclass with `time` and `start`, that has `effective_time`."""
 
+    has_photons: bool = False
+    """Whether images of mu are line integrals, through which the photons of an X-ray source pass (`intensity`)."""
+
+    takes_ct_numbers: bool = False
+    """Whether volumes may be CT numbers, or mu at any energy, which `in_model_quantity` converts."""
+
+    ends_at_detector: bool = True
+    """Whether rays end at the detector's plane, so that parts of the volume beyond it are not imaged."""
+
+    photon_lines: tuple[tuple[float, float], ...] = ()
+    """Detected photon lines of the isotope, () without one: energies, keV, in order, and detected photons per decay."""
+
+    detected_energies: tuple[float, float] | None = None
+    """Energies, keV, between which photons are detected; None if the model does not know them."""
+
     has_geometry_gradient: bool = False
     """Whether `by_depth` follows the modules of the model's `system`; then it also has `optics` and `crystal_pitch`."""
 
@@ -67,13 +83,46 @@ class Model(ABC):
         """Yield a warning for each attenuation coefficient that looks wrong, such as one in 1/cm."""
         return iter(())
 
-    def of_views(self, indices: NDArray[np.integer]) -> Model:
-        """Return the model of the views with these indices alone."""
+    def of_views(self, which: NDArray[np.integer]) -> Model:
+        """Return the model of the views `which` alone, indices from 0."""
         return self
 
     def parts(self) -> tuple[Model, ...]:
         """Return the models whose images add up to the images of this one; it alone if it is computed as a whole."""
         return (self,)
+
+    def image_warnings(self, volume: Volume, views: Views) -> Iterator[str]:
+        """Yield a warning for each reason for which the images of a volume are probably not the intended ones."""
+        return iter(())
+
+    def mu_warnings(self, mu: Floats32) -> Iterator[str]:
+        """Yield a warning if attenuation coefficients `mu` (n_x, n_y, n_z), 1/mm, in place of the model's look wrong."""
+        return iter(())
+
+    def in_model_quantity(self, volume: Volume, energy: float | None) -> Volume:
+        """Return a volume in the quantity that the model images; `energy` is that of its mu, keV."""
+        return volume
+
+    def linear(self) -> Model:
+        """Return the model of the images' line integrals, for reconstruction; it alone if images are linear in volumes."""
+        return self
+
+    def expected_images(
+        self, A: Any, volume: Volume, progress: Progress | None = None, mu: Floats32 | None = None
+    ) -> Floats32:
+        """Return the expected images (M, n_v, n_u) of a volume by `A`, a `Projector` with this model, without background.
+
+        `mu` (n_x, n_y, n_z), 1/mm, attenuates in place of the model's; `progress` is called after every view.
+        """
+        return np.asarray(A(volume, progress, mu))
+
+    def coarse(self) -> Model:
+        """Return a quick model of about the same counts, for comparisons of likelihoods."""
+        return self
+
+    def without_blur(self) -> Model:
+        """Return the model with one ray for each pixel, through an ideal aperture."""
+        return self
 
     def check_volume(self, volume: Volume) -> None:
         """Raise `InputError` if the model cannot project a volume of this quantity."""
@@ -125,6 +174,7 @@ class Transmission(Model):
     tolerance: float = TOLERANCE
 
     name = "transmission"
+    has_photons = True
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "pixel_points", require_points(self.pixel_points, "transmission: pixel_points"))

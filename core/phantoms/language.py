@@ -31,7 +31,7 @@ import numpy as np
 
 from ..errors import InputError, naming
 from ..files import AnyPath, require_ending, write_bytes
-from ..toml import parse_toml, read_toml, toml_value
+from ..recipes.toml import parse_toml, read_toml, toml_value
 from ..validation import instance
 from .derenzo import DerenzoRods
 from .phantom import Phantom, ShapePhantom

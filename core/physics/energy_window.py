@@ -107,7 +107,7 @@ def energy_window_scatter(
     fwhm : float, optional
         FWHM, in pixels, of a Gaussian that smooths the estimate: scatter is smoother than noise. Its weights within the
         image sum to 1 for each pixel, so a constant estimate is unchanged.
-    efficiency : number or array (M, n_v, n_u)
+    efficiency : float or array (M, n_v, n_u)
         Efficiency of the pixels, as in `Emission`: the photons are smoothed, and each pixel counts its share of them. Pixels
         of efficiency 0, dead or hot, do not contribute, and their smoothed estimate is 0.
     shares : sequence of 3 numbers, optional

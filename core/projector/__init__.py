@@ -1,8 +1,10 @@
 """The projector: the linear map from a volume to the images of a scanner's modules, and its exact adjoint.
 
-`Projector` (`operator.py`) joins a grid, views and a model of what a pixel measures; ``A(x)`` are images, ``A.T(y)`` is the
-adjoint. `FrameProjector` (`frames.py`) has a volume and images for each frame of a scan. `geometry_gradient` gives the
-derivatives of counts by the modules' geometry; `torch_cameras.py` makes images from poses, part of torch's graph.
+`Projector` (`operator.py`) joins a grid, views and a model of what a pixel measures; ``A(x)`` are images, ``A.T(y)`` is
+the adjoint (`Projector._run_back`, which is also torch's gradient). `FrameProjector` (`frames.py`) has a volume and
+images for each frame of a scan. `geometry_gradient` gives the derivatives of counts by the modules' geometry;
+`torch_cameras.py` makes images from poses, part of torch's graph. Voxels too close for the pinhole response are added by
+rays in `operator.py`.
 
 Nothing is added here for a new model (`core.models`) or a new way to trace rays (`core.rays`): the projector asks both.
 torch is not imported before it is needed.

@@ -214,7 +214,7 @@ class Attenuation:
     mu: Any
     """(n_x, n_y, n_z), attenuation coefficients, 1/mm, of the backend's kind; 0 outside."""
     rays: Rays | None = None
-    """The same rays in the index space of mu; None if mu shares the volume's lattice."""
+    """Rays of the line integrals in the index space of mu; None if mu shares the volume's lattice."""
 
 
 def index_fans(

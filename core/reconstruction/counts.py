@@ -1,4 +1,4 @@
-"""Counts with an additive background: their log-likelihood, checks of what a reconstruction is given, and its loop."""
+"""Measured counts with an additive background: Poisson log-likelihood, checks, and the iteration loop of count methods."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -9,103 +9,111 @@ from ..arrays import Array, ArrayLike, Integers
 from ..errors import InputError, warn
 from ..geometry.frames import affine_matrix
 from ..geometry.grid import Grid
-from ..geometry.system import PinholeSystem
 from ..memory import require
 from ..progress import Progress
-from ..projector import Emission, Projector
+from ..projector import Projector
 from ..validation import instance, real_array, shape_text
-from .loop import Loop, plain
-from .priors import Prior, penalty_of
+from .loop import Loop, numpy_if_tensor
+from .priors import Prior, make_penalty
 
-# Less is nothing: float32 could not hold what it would be divided into.
-LEAST = np.float32(1e-30)
+NEGLIGIBLE = np.float32(1e-30)
+"""Divisor at or below which a quotient is left out, because float32 could not hold it."""
 
-_SURE, _SURE_SHARE = 30.0, 0.015
-"""Log-likelihood that chance does not give, and, as a share of the counts, that a coarse model does not."""
+_CERTAIN_GAIN, _CERTAIN_SHARE = 30.0, 0.015
+"""Gain of log-likelihood that chance cannot explain, and the share of the counts that a coarse model cannot explain."""
 
 
 @dataclass(frozen=True, eq=False)
 class CountData:
-    """Measured counts (M, n_v, n_u) and the background, of the same shape, that is in them besides the volume's."""
+    """Measured counts, and the background, the part of their expected value that does not come from the volume."""
 
     counts: Array
+    """Measured counts (M, n_v, n_u)."""
     background: Array
+    """Expected background counts (M, n_v, n_u)."""
 
     @classmethod
-    def of(cls, method: str, A: Projector, counts: ArrayLike, background: ArrayLike = 0.0) -> "CountData":
-        """Checked: `A` is of emission; counts and background are at least 0, of the projector's shape.
+    def checked(cls, method: str, A: Projector, counts: ArrayLike, background: ArrayLike = 0.0) -> "CountData":
+        """Return count data with 0 in dead pixels; raise `InputError` unless they fit the emission projector `A`.
 
-        The background is one number, one for each module (M,), or images; that of the projector's model is added to it.
-        Raises InputError. Pixels that are dead in the model are left out.
+        `counts` are images (M, n_v, n_u) of 0 or more. `background`, 0 or more, is one number, one for each module (M,), or
+        images; the background of the projector's model is added to it. `method` names the caller in messages.
         """
         instance(A, Projector, method)
         if A.model.takes != ("activity",):
             raise InputError(f"{method}: expected a projector of emission, got one of {A.model.name}")
-        measured = real_array(plain(counts), "counts", A.shape_out, np.float32)
-        _require_none_below_0(measured, "counts")
-        extra = real_array(plain(background), "background", None, np.float32)
-        _require_none_below_0(extra, "background")
+        measured = real_array(numpy_if_tensor(counts), "counts", A.shape_out, np.float32)
+        _require_nonnegative(measured, "counts")
+        extra = real_array(numpy_if_tensor(background), "background", None, np.float32)
+        _require_nonnegative(extra, "background")
         if extra.shape == A.shape_out[:1]:
             extra = extra[:, None, None]
         elif extra.shape not in ((), A.shape_out):
             shapes = f"one number, {A.shape_out[0]} numbers or images of {shape_text(A.shape_out)}"
             raise InputError(f"background: expected {shapes}, got {shape_text(extra.shape)}")
-        known = A.background.astype(np.float32)
-        if extra.any() and known.any():
-            both = f"{extra.mean():.3g} counts a pixel, besides the {known.mean():.3g} of the projector's model"
-            warn(f"background: {both}: both are expected; leave one out if they are the same", 4)
-        data = cls(measured, extra + known).living(A)
-        if isinstance(A.model, Emission) and len(A.views) > 3:  # two or three say too little
-            _warn_if_reversed(A, A.model.system, data)
+        modelled = A.background.astype(np.float32)
+        if extra.any() and modelled.any():
+            means = f"{extra.mean():.3g} counts per pixel, besides {modelled.mean():.3g} of the projector's model"
+            warn(f"background: {means}: the sum is expected; leave one out if both are the same", 4)
+        data = cls(measured, extra + modelled).without_dead_pixels(A)
+        if A.model.has_times and len(A.views) > 3:  # two or three views say too little
+            _warn_if_reversed(A, data)
         return data
 
-    def living(self, A: Projector) -> "CountData":
-        """The same data, with nothing in pixels that are dead in a projector's model: they then say nothing."""
+    def without_dead_pixels(self, A: Projector) -> "CountData":
+        """Return these data with 0 in the pixels that are dead in the model of `A`, where they do not affect the volume."""
         return CountData(*(np.where(A.living, data, np.float32(0)) for data in (self.counts, self.background)))
 
-    def __getitem__(self, which: Integers) -> "CountData":
-        return CountData(self.counts[which], self.background[which])
+    def __getitem__(self, modules: Integers) -> "CountData":
+        return CountData(self.counts[modules], self.background[modules])
 
     def ratio(self, images: Array) -> Array:
-        """Measured by expected counts, where a volume's are `images`; 0 where neither is above 0.
+        """Return ``counts / (images + background)`` (M, n_v, n_u) for a volume with the expected counts `images`.
 
-        A pixel that counted something which nothing can have caused is left out: it says nothing about the volume.
+        The ratio is 0 in pixels without expected counts: counts that neither the volume nor the background can have caused
+        say nothing about the volume.
         """
         expected = images + self.background
-        return np.divide(self.counts, expected, out=np.zeros_like(expected), where=expected > LEAST)
+        return np.divide(self.counts, expected, out=np.zeros_like(expected), where=expected > NEGLIGIBLE)
 
     def log_likelihood(self, images: Array) -> float:
-        """The log-likelihood (Poisson) of a volume with the images `images`, without the terms that no volume changes.
+        """Return ``sum(counts log(e) - e)``, e = images + background: the Poisson log-likelihood but for a constant.
 
-        Pixels with counts that nothing can have caused are left out, as in `ratio`.
+        Counts in pixels without expected counts are left out, as in `ratio`.
         """
         expected = images.astype(np.float64) + self.background
-        logs = np.log(expected, out=np.zeros_like(expected), where=expected > LEAST)
+        logs = np.log(expected, out=np.zeros_like(expected), where=expected > NEGLIGIBLE)
         return float(np.sum(self.counts * logs) - expected.sum())
 
 
 class CountLoop(Loop):
-    """The iterations of a method for counts: a `Loop` that knows them, in subsets of the views, and the prior's penalty.
+    """Loop of a method for counts: a `Loop` with the counts of each subset of the views and the prior's penalty.
 
     Parameters
     ----------
     method, A, counts, iterations, prior, background
         See `mlem`.
     subsets : int, optional
-        By default about a fifth of the views' number.
+        Number of subsets; by default about a fifth of the number of views.
     options, named
         See `IterativeOptions`.
 
     Attributes
     ----------
     data : CountData
-    parts : list of tuples
-        Each subset's projector and counts.
-    seen : list of arrays (n_x, n_y, n_z)
-        Counts that one unit of activity in each voxel gives in each subset; `total` is their sum.
+        Counts and background of all views.
+    subsets : list of tuples
+        Projector and count data of each subset.
+    sensitivities : list of arrays (n_x, n_y, n_z)
+        Sensitivity ``A_s.T(1)`` of each subset: its counts per unit of activity in each voxel.
+    sensitivity : array (n_x, n_y, n_z)
+        Sum of the sensitivities.
     visible : array of bool
         Voxels in the mask that some pixel sees.
     penalty : Penalty or None
+        Penalty of the prior for pairs of visible voxels; None without a prior.
+    last_objective : float
+        Value that `objective` returned last; -inf before its first call.
     """
 
     def __init__(
@@ -121,66 +129,66 @@ class CountLoop(Loop):
         **named: Any,
     ) -> None:
         super().__init__(method, A, iterations, *options, **named)
-        self.data = CountData.of(method, A, counts, background)
-        parts = A.subsets(max(1, len(A.views) // 5) if subsets is None else subsets)
-        self.parts = [(part, self.data[part.which]) for part in parts]
-        require(4 * A.grid.n_voxels * len(parts), f"the sensitivities of {len(parts)} subsets")
-        ones = ((part, np.ones(part.shape_out, np.float32)) for part, _ in self.parts)
-        self.seen = [np.asarray(part.T(one, self.preparing()), np.float32) for part, one in ones]
-        self.total: Array = sum(self.seen[1:], self.seen[0])
-        self.visible = self.mask & (self.total > LEAST)
-        self.prior, self.penalty = prior, penalty_of(prior, A.grid, self.visible)
-        self._images: Array | None = None  # of the volume whose objective was asked for last
-        self.last = -np.inf  # its objective
+        self.data = CountData.checked(method, A, counts, background)
+        projectors = A.subsets(max(1, len(A.views) // 5) if subsets is None else subsets)
+        self.subsets = [(projector, self.data[projector.which]) for projector in projectors]
+        require(4 * A.grid.n_voxels * len(projectors), f"the sensitivities of {len(projectors)} subsets")
+        ones = ((projector, np.ones(projector.shape_out, np.float32)) for projector in projectors)
+        self.sensitivities = [np.asarray(projector.T(image, self.preparing()), np.float32) for projector, image in ones]
+        self.sensitivity: Array = sum(self.sensitivities[1:], self.sensitivities[0])
+        self.visible = self.mask & (self.sensitivity > NEGLIGIBLE)
+        self.prior, self.penalty = prior, make_penalty(prior, A.grid, self.visible)
+        self._images: Array | None = None  # of the volume in the last call of `objective`
+        self.last_objective = -np.inf
 
     def images(self, s: int, values: Array, progress: Progress | None) -> Array:
-        """The images of a volume in subset `s`: known where it is what the last step gave."""
-        part, _ = self.parts[s]
+        """Return the images of a volume in subset `s`; those of the last iteration's volume are not computed again."""
+        projector, _ = self.subsets[s]
         if values is self.values and self._images is not None:
-            return self._images[part.which]
-        return np.asarray(part(values, progress))
+            return self._images[projector.which]
+        return np.asarray(projector(values, progress))
 
     def objective(self, values: Array, progress: Progress | None) -> float:
-        """The log-likelihood of a volume, less the prior's penalty."""
+        """Return the log-likelihood of a volume minus the prior's penalty."""
         images: Array = self._A(values, progress)
         likelihood = self.data.log_likelihood(images)
         self._images = images
-        self.last = likelihood if self.penalty is None else likelihood - self.penalty.value(values)
-        return self.last
+        self.last_objective = likelihood if self.penalty is None else likelihood - self.penalty.value(values)
+        return self.last_objective
 
     def record(self) -> dict[str, Any]:
-        """The number of subsets, totals, counts that one unit of activity in all voxels gives, and the prior."""
-        sums = {"counts": self.data.counts, "background": self.data.background, "sensitivity": self.total}
-        known = {name: float(numbers.sum(dtype=float)) for name, numbers in sums.items()}
-        return {"subsets": len(self.parts), **known} | ({"prior": None} if self.prior is None else self.prior.record())
+        """Return the number of subsets, the sums of counts, background and sensitivity, and the prior's settings."""
+        arrays = {"counts": self.data.counts, "background": self.data.background, "sensitivity": self.sensitivity}
+        sums = {name: float(numbers.sum(dtype=float)) for name, numbers in arrays.items()}
+        return {"subsets": len(self.subsets), **sums} | ({"prior": None} if self.prior is None else self.prior.record())
 
 
-def _coarse(model: Any) -> Emission:
-    """An ideal pinhole of few rays, with the model's times and efficiencies."""
-    own = {"time": model.effective_time, "efficiency": model.efficiency}
-    return Emission(model.system, pixel_points=1, tolerance=1e9, **own)
+def _warn_if_reversed(A: Projector, data: CountData) -> None:
+    """Warn if the counts are far likelier with the modules in reversed order.
 
-
-def _warn_if_reversed(A: Projector, system: PinholeSystem, data: CountData) -> None:
-    """Warn where the counts are far likelier of the modules in reversed order: by a step of MLEM on few, large voxels."""
-    chosen = np.unique(np.rint(np.linspace(0, len(system) - 1, min(len(system), 16))).astype(int))  # symmetric
+    The log-likelihoods of both orders are compared after one MLEM step with at most 16 modules and 20^3 large voxels.
+    """
+    # The choice of modules is symmetric, so that it is the same in reversed order.
+    modules = np.unique(np.rint(np.linspace(0, len(A.views) - 1, min(len(A.views), 16))).astype(int))
     shape = np.minimum(A.grid.shape, 20)
     step = A.grid.shape / shape
     grid = Grid(tuple(shape), A.grid.affine @ affine_matrix(np.diag(step), (step - 1) / 2))
-    B = Projector(grid, A.views[chosen], _coarse(A.model.of_views(chosen)), A.backend, A.threads)
-    part, seen = data[chosen], np.maximum(B.T(np.ones(B.shape_out, np.float32)), LEAST)
-    total, likelihoods = float(part.counts.sum(dtype=float)), []
-    even = np.full(shape, total / seen.sum(dtype=float), np.float32)
-    everywhere = part.background + np.float32(0.01 * total / part.counts.size)  # also where B expects nothing
-    for data in (CountData(part.counts, everywhere), CountData(part.counts[::-1], everywhere)):
-        likelihoods.append(data.log_likelihood(B(even / seen * B.T(data.ratio(B(even))))))
-    if (gain := likelihoods[1] - likelihoods[0]) > max(_SURE, _SURE_SHARE * total):
-        found = f"(log-likelihood {gain:.4g} higher, {total:.4g} counts of {len(chosen)} modules)"
-        warn(f"counts: likelier of the modules in reversed order {found}: are both in the same order?", 5)
+    B = Projector(grid, A.views[modules], A.model.of_views(modules).coarse(), A.backend, A.threads)
+    subset, sensitivity = data[modules], np.maximum(B.T(np.ones(B.shape_out, np.float32)), NEGLIGIBLE)
+    n_counts, likelihoods = float(subset.counts.sum(dtype=float)), []
+    uniform = np.full(shape, n_counts / sensitivity.sum(dtype=float), np.float32)
+    # A small background keeps pixels without expected counts in the likelihood.
+    background = subset.background + np.float32(0.01 * n_counts / subset.counts.size)
+    for data in (CountData(subset.counts, background), CountData(subset.counts[::-1], background)):
+        likelihoods.append(data.log_likelihood(B(uniform / sensitivity * B.T(data.ratio(B(uniform))))))
+    if (gain := likelihoods[1] - likelihoods[0]) > max(_CERTAIN_GAIN, _CERTAIN_SHARE * n_counts):
+        numbers = f"(log-likelihood {gain:.4g} higher, {n_counts:.4g} counts of {len(modules)} modules)"
+        warn(f"counts: likelier with the modules in reversed order {numbers}: are both in the same order?", 5)
 
 
-def _require_none_below_0(numbers: Array, name: str) -> None:
+def _require_nonnegative(numbers: Array, name: str) -> None:
+    """Raise `InputError` with the smallest number and its index unless all numbers are 0 or more."""
     if numbers.min(initial=0.0) < 0:
         index = np.unravel_index(numbers.argmin(), numbers.shape)
-        where = f" at index {tuple(int(i) for i in index)}" if index else ""
-        raise InputError(f"{name}: expected 0 or more, got {numbers.min():g}{where}")
+        position = f" at index {tuple(int(i) for i in index)}" if index else ""
+        raise InputError(f"{name}: expected 0 or more, got {numbers.min():g}{position}")

@@ -1,4 +1,4 @@
-"""Maximum likelihood by expectation maximisation: MLEM and OSEM."""
+"""Maximum likelihood by expectation maximisation: MLEM and its ordered-subsets form OSEM."""
 
 from typing import Any, Unpack
 
@@ -9,17 +9,26 @@ from ..errors import warn
 from ..progress import Progress, tell
 from ..projector import Projector
 from ..projector.subsets import access_order
-from .counts import LEAST, CountLoop
-from .loop import IterativeOptions, waiting
+from .arguments import argument
+from .counts import NEGLIGIBLE, CountLoop
+from .loop import IterativeOptions, fixed_progress
 from .priors import Prior
 from .result import Reconstruction
 
-_LEAST_SHARE = 0.1
-"""A prior leaves at least this share of the sensitivity everywhere."""
-_TOO_LATE = 0.05
-"""Where a prior goes below it in a larger share of the voxels, volumes swing from iteration to iteration."""
+_SMALLEST_DIVISOR = 0.1
+"""Lower bound of the divisor ``sensitivity + prior gradient``, as a share of the sensitivity."""
+_MAX_BOUNDED_SHARE = 0.05
+"""Share of the voxels at the divisor's lower bound above which volumes oscillate from iteration to iteration."""
 
 
+@argument("iterations", int, "Number of passes over all images", "what suits the method", least=1, slider=100)
+@argument(
+    "background",
+    float,
+    "Expected counts of each pixel that do not come from the volume, such as scatter",
+    least=0,
+    slider=100,
+)
 def mlem(
     A: Projector,
     counts: ArrayLike,
@@ -29,38 +38,38 @@ def mlem(
     prior: Prior | None = None,
     **named: Unpack[IterativeOptions],
 ) -> Reconstruction:
-    """The activity for which the counts are most likely, by MLEM: ``x <- x / A.T(1) * A.T(counts / (A x + background))``.
+    """Reconstruct the activity of maximum likelihood (MLEM): ``x <- x / A.T(1) * A.T(counts / (A x + background))``.
 
     Parameters
     ----------
     A : Projector
         A projector of emission, from the volume's grid to the counts' images.
     counts : array or tensor (M, n_v, n_u)
-        Measured counts, 0 or more; expected means may be fractions.
+        Measured counts, 0 or more; expected counts, which may be fractions, are allowed too.
     iterations : int
-        How many are done in this call. The log-likelihood never falls from one to the next.
-    background : number, array (M,) or (M, n_v, n_u)
-        Counts expected besides those of the volume, such as scatter.
+        Number of iterations of this call. Without a prior the log-likelihood never falls from one to the next.
+    background : float, array (M,) or (M, n_v, n_u)
+        Expected counts that do not come from the volume, such as scatter.
     *options, **named
-        See `IterativeOptions`. Without `start` it begins with 1 everywhere; what is 0 in `start` stays 0.
+        See `IterativeOptions`. Without `start` every voxel begins with 1; voxels that are 0 in `start` stay 0.
     prior : Quadratic, RelativeDifference or TotalVariation, optional
-        Penalises noise, one step late: its gradient at the volume before the update is added to the sensitivity that divides
-        (Green 1990). Where the sum is below a tenth of the sensitivity it is that tenth, so that the volume stays positive
-        and a strong prior's update goes at most ten times as far. The penalised likelihood may fall; `bsrem` makes it as
-        large as it can be.
+        Penalty on noise, applied one step late (Green 1990): the prior's gradient at the volume before the update is added
+        to the sensitivity in the divisor. The divisor is at least a tenth of the sensitivity, so that the volume stays
+        positive and no update is more than ten times as large as without a prior. The penalised likelihood may fall;
+        `bsrem` maximises it.
 
     Returns
     -------
     Reconstruction
-        `objective` is the log-likelihood after each iteration, without terms that no volume changes, less the prior's
-        penalty. Voxels that no pixel sees are 0. Pixels with counts which neither the volume nor the background can have
-        caused are left out.
+        `objective` is the log-likelihood minus the prior's penalty after each iteration, without the terms that do not
+        depend on the volume. Voxels that no pixel sees are 0. Pixels with counts but without any expected counts are
+        ignored.
 
     Raises
     ------
     InputError
-        Counts, background, start or mask have another shape or grid, or are negative or not finite; `prior` is none, or its
-        anatomy has another grid; `start` is to be resumed with other data, another model or other arguments.
+        Counts, background, start or mask have a wrong shape or grid, or are negative or not finite; `prior` is no prior, or
+        its anatomy has another grid; `start` is a reconstruction from other data, another model or other arguments.
 
     References
     ----------
@@ -73,6 +82,8 @@ def mlem(
     return _em(CountLoop("MLEM", A, counts, iterations, 1, prior, background, *options, **named))
 
 
+@argument("subsets", int, "Number of subsets of the modules; each update of an iteration uses one subset",
+          "about a fifth of the number of modules", least=1, slider=80)  # fmt: skip
 def osem(
     A: Projector,
     counts: ArrayLike,
@@ -83,11 +94,12 @@ def osem(
     *options: Any,
     **named: Unpack[IterativeOptions],
 ) -> Reconstruction:
-    """The activity for which the counts are most likely, by updates for each subset of the views (OSEM).
+    """Reconstruct the activity of approximately maximum likelihood by an MLEM update for each subset of the views (OSEM).
 
-    It is faster than `mlem`, whose parameters it takes, by about the number of subsets at first; it ends beside the maximum
-    of the likelihood, which may fall. `subsets` is by default about a fifth of the views' number, so that each sees the
-    object from five sides or more. A voxel that a subset does not see keeps its value in that update.
+    The parameters are those of `mlem`. At first OSEM is faster by a factor of about the number of subsets. It ends near the
+    maximum of the likelihood, not at it, and the likelihood may fall. `subsets` is by default about a fifth of the number of
+    views, so that each subset sees the object from five or more directions. A voxel that a subset does not see keeps its
+    value in that update.
 
     References
     ----------
@@ -98,27 +110,28 @@ def osem(
 
 
 def _em(loop: CountLoop) -> Reconstruction:
-    n, penalty = len(loop.parts), loop.penalty
+    """Run the expectation-maximisation updates of all subsets in each iteration and return the reconstruction."""
+    n, penalty = len(loop.subsets), loop.penalty
     loop.values = np.where(loop.visible, loop.values, np.float32(0))
-    too_late = 0.0  # largest share of the voxels in which the prior outweighs the counts
+    bounded_share = 0.0  # largest share of the voxels in which the prior pulls the divisor below its lower bound
 
     def step(number: int, x: Array, progress: Progress | None) -> tuple[Array, float]:
-        nonlocal too_late
+        nonlocal bounded_share
         for k, s in enumerate(access_order(n)):
-            part, own = loop.parts[s]
-            asked = waiting(progress, k, n)
-            factor = part.T(own.ratio(loop.images(s, x, asked)), asked)
-            divisor = loop.seen[s]
+            projector, data = loop.subsets[s]
+            subset_progress = fixed_progress(progress, k, n)
+            factor = projector.T(data.ratio(loop.images(s, x, subset_progress)), subset_progress)
+            divisor = loop.sensitivities[s]
             if penalty is not None:
-                late, least = divisor + penalty.gradient(x) / n, _LEAST_SHARE * divisor
-                too_late = max(too_late, float(np.mean((late < least)[loop.visible])))
-                divisor = np.maximum(late, least)
-            factor = np.divide(factor, divisor, out=np.ones_like(x), where=loop.seen[s] > LEAST)
+                penalised, lower_bound = divisor + penalty.gradient(x) / n, _SMALLEST_DIVISOR * divisor
+                bounded_share = max(bounded_share, float(np.mean((penalised < lower_bound)[loop.visible])))
+                divisor = np.maximum(penalised, lower_bound)
+            factor = np.divide(factor, divisor, out=np.ones_like(x), where=loop.sensitivities[s] > NEGLIGIBLE)
             x = np.multiply(x, factor, out=factor)
             tell(progress, k + 1, n)
-        return x, loop.objective(x, waiting(progress, n, n))
+        return x, loop.objective(x, fixed_progress(progress, n, n))
 
     result = loop.run(step)
-    if too_late > _TOO_LATE:
-        warn(f"prior: too strong for one step late in {too_late:.0%} of the voxels: take less weight, or bsrem")
+    if bounded_share > _MAX_BOUNDED_SHARE:
+        warn(f"prior: too strong for one step late in {bounded_share:.0%} of the voxels: take less weight, or bsrem")
     return result

@@ -1,4 +1,4 @@
-"""Reconstructions in files, from which they can be resumed."""
+"""Read and write files of reconstructions, from which these can be resumed."""
 
 import json
 from typing import Any
@@ -19,10 +19,10 @@ _ENDINGS = (".h5", ".hdf5")
 
 
 def write_reconstruction(result: Reconstruction, path: AnyPath) -> None:
-    """Write a reconstruction as HDF5 (.h5, .hdf5), with all that is needed to resume it.
+    """Write a reconstruction as HDF5 (.h5, .hdf5), with everything that is needed to resume it.
 
-    `read_volume` reads the volume of such a file. Raises InputError for another ending, or where it cannot be written: an
-    older file then stays.
+    `read_volume` reads the volume of such a file. Raise `InputError` for another ending, or if the file cannot be written;
+    an existing file is then left unchanged.
     """
     require_ending(path, _ENDINGS)
     instance(result, Reconstruction, "write_reconstruction")
@@ -39,7 +39,7 @@ def write_reconstruction(result: Reconstruction, path: AnyPath) -> None:
 
 
 def read_reconstruction(path: AnyPath) -> Reconstruction:
-    """Read a file of `write_reconstruction`; InputError where there is none, or no whole reconstruction in it."""
+    """Read a file of `write_reconstruction`; raise `InputError` if it is missing, or holds no complete reconstruction."""
     import h5py
 
     require_ending(path, _ENDINGS)

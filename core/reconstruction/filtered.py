@@ -1,4 +1,4 @@
-"""What FBP and FDK have in common: images weighted, filtered row by row, and backprojected."""
+"""Filtered backprojection shared by FBP and FDK: weight the images, filter them row by row, and backproject them."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -14,70 +14,76 @@ from ..perspective.places import gather
 from ..progress import Progress, tell
 from ..rays.parallel import run_all, thread_count
 from ..validation import instance, real_array
-from .loop import plain
+from .loop import numpy_if_tensor
 from .ramp import ramp_matrix
 
-_BYTES_AT_ONCE = 2**26
-"""Filtered images that are held at once."""
+_BATCH_BYTES = 2**26
+"""Memory, bytes, of the filtered images that are held at once."""
 
-_BEHIND = 1e-3
-"""Nothing is taken that is nearer to the source than this share of its distance from the detector."""
+_NEAREST_DEPTH = 1e-3
+"""Smallest distance of a voxel from the source that receives values, as a share of the distance to the detector."""
 
-_SMALL_GAP, _OUTSTANDING = np.radians(20), 3
-"""A gap between neighbouring views belongs to their spacing if it is at most so large, or so many times the usual one."""
+_SMALL_GAP, _GAP_FACTOR = np.radians(20), 3
+"""Largest gap between neighbouring views that counts as their spacing: an angle, or a multiple of the median gap."""
 
-_EQUAL = 1e-6
-"""Angles that differ by less, as a share of the turn, are equal."""
+_ANGLE_TOLERANCE = 1e-6
+"""Largest difference of two angles that count as equal, as a share of the turn."""
 
-_FALLEN, _BY_NOISE = 0.05, 6
-"""Images have fallen to 0 where they are less than this share of the largest value, or so many deviations of the noise."""
+_NEGLIGIBLE_EDGE, _EDGE_DEVIATIONS = 0.05, 6
+"""Largest edge value of an image that is not cut off: a share of the largest value, or a multiple of the noise."""
 
-_MOST_TILT = np.radians(15)
-"""The largest angle between an image's rows and the plane in which the views turn."""
+_MAX_TILT = np.radians(15)
+"""Largest angle between an image's rows and the plane in which the views turn."""
 
 
 def checked_images(images: ArrayLike, quantity: str | None, views: Views, grid: Grid, name: str) -> tuple[Array, str]:
-    """`images` as float32 and their volume's quantity, or `InputError`, also where views or grid are none, or too few."""
+    """Return `images` as float32 (M, n_v, n_u) and the quantity of the volume to reconstruct.
+
+    Raise `InputError` unless there are two or more views, a grid, and images of the views' shape. `name` names the method
+    in messages.
+    """
     quantity = str(quantity or getattr(images, "quantity", "mu"))
     instance(views, Views, f"{name}: views")
     instance(grid, Grid, f"{name}: grid")
     if len(views) < 2:
         raise InputError(f"{name}: expected two views or more, got {len(views)}")
-    return real_array(plain(images), f"{name}: images", (len(views), *views.shape), np.float32), quantity
+    return real_array(numpy_if_tensor(images), f"{name}: images", (len(views), *views.shape), np.float32), quantity
 
 
 def rows_across(images: Array, views: Views, axis: Array, name: str) -> tuple[Array, Views]:
-    """Images and views whose rows lie about in the plane across `axis`: as they are, or rows and columns exchanged.
+    """Return images and views whose rows lie about in the plane normal to `axis` (3,), rows and columns swapped if needed.
 
-    Warns where the images do not fall to about 0 at their edge columns.
+    Raise `InputError` if neither rows nor columns lie in that plane. Warn if the images do not fall to about 0 at their edge
+    columns.
     """
     along_rows, along_columns = (
         np.abs(steps @ axis) / np.linalg.norm(steps, axis=1) for steps in (views.u_steps, views.v_steps)
     )
     if along_columns.max() < along_rows.min():
-        turned = replace(views, u_steps=views.v_steps, v_steps=views.u_steps, shape=views.shape[::-1])
-        images, views, along_rows = images.swapaxes(1, 2), turned, along_columns
+        swapped = replace(views, u_steps=views.v_steps, v_steps=views.u_steps, shape=views.shape[::-1])
+        images, views, along_rows = images.swapaxes(1, 2), swapped, along_columns
     worst = int(along_rows.argmax())
-    if along_rows[worst] > np.sin(_MOST_TILT):
+    if along_rows[worst] > np.sin(_MAX_TILT):
         raise InputError(
             f"{name}: view {worst}: its rows are tilted by {np.degrees(np.arcsin(along_rows[worst])):.0f} degrees against "
-            f"the plane in which the views turn, more than {np.degrees(_MOST_TILT):.0f}: turn the images, or use sirt"
+            f"the plane in which the views turn, more than {np.degrees(_MAX_TILT):.0f}: turn the images, or use sirt"
         )
-    _warn_of_cut(images, name)
+    _warn_if_truncated(images, name)
     return images, views
 
 
-def _warn_of_cut(images: Array, name: str) -> None:
-    """Warn where the images do not fall to about 0 at their edge columns: the filter takes what is beyond them for 0."""
+def _warn_if_truncated(images: Array, name: str) -> None:
+    """Warn if the images do not fall to about 0 at their edge columns: the filter assumes 0 beyond them."""
     edges = np.stack([images[:, :, :4], images[:, :, :-5:-1]], axis=-2, dtype=float)  # (M, n_v, 2, 4), outermost first
-    noise = np.sqrt(np.mean(np.diff(edges, 3) ** 2) / 20)  # neither values nor slopes count in third differences
+    noise = np.sqrt(np.mean(np.diff(edges, 3) ** 2) / 20)  # values and slopes cancel out in third differences
     largest, outermost = float(np.abs(images).max()), edges[..., :2].mean(axis=-1)
     for means in (outermost, outermost.mean(axis=1), outermost.mean(axis=(0, 1))):  # pixels, views, both edges
-        found = float(np.abs(means).max())
-        if found > max(_FALLEN * largest, _BY_NOISE * noise * np.sqrt(means.size / outermost.size / 2)):
-            share = f"{found / largest:.0%} of their largest value"
-            beyond = "what is beyond is missing, and values are wrong"
-            return warn(f"{name}: the images fall only to {share} at their edge columns: {beyond}", 4)
+        edge_value = float(np.abs(means).max())
+        noise_limit = _EDGE_DEVIATIONS * noise * np.sqrt(means.size / outermost.size / 2)
+        if edge_value > max(_NEGLIGIBLE_EDGE * largest, noise_limit):
+            share = f"{edge_value / largest:.0%} of their largest value"
+            effect = "the object beyond the edge is missing, and values are wrong"
+            return warn(f"{name}: the images fall only to {share} at their edge columns: {effect}", 4)
 
 
 def filtered_backprojection(
@@ -88,39 +94,42 @@ def filtered_backprojection(
     weights: Callable[[int], Array | float],
     progress: Progress | None = None,
 ) -> Array:
-    """The sum over views of ``(images * weights(m))`` filtered along rows, at the voxels' places, by depth^2; float32."""
+    """Return the sum over views of the filtered images ``images[m] * weights(m)`` at the voxels, divided by depth^2.
+
+    The rows are filtered with the ramp filter times `window` (see `ramp_matrix`). The volume is float32 (n_x, n_y, n_z).
+    """
     n, (n_v, n_u) = len(images), views.shape
     matrices = views.projection_matrices()
-    beyond = _columns_beyond(matrices, grid, n_u)
-    matrix = ramp_matrix(n_u, window, beyond)
+    margin = _margin_columns(matrices, grid, n_u)
+    matrix = ramp_matrix(n_u, window, margin)
     column, row, depth = np.moveaxis(matrices, 1, 0)
-    # Images have a margin of zeros, so that beyond their edge they fall to 0 over one pixel.
-    of_place = np.stack([row + depth, column + (beyond + 1) * depth, 0 * depth, depth, 0 * depth], axis=1) @ grid.affine
-    bytes_of_a_view = 4 * n_v * (matrix.shape[1] + n_u)
-    at_once = int(np.clip(_BYTES_AT_ONCE // bytes_of_a_view, 1, n))
-    require(4 * grid.n_voxels + at_once * bytes_of_a_view, f"a volume of {' x '.join(map(str, grid.shape))} voxels")
+    # A border of zeros around the images lets them fall to 0 over one pixel beyond their edge.
+    maps = np.stack([row + depth, column + (margin + 1) * depth, 0 * depth, depth, 0 * depth], axis=1) @ grid.affine
+    view_bytes = 4 * n_v * (matrix.shape[1] + n_u)
+    batch = int(np.clip(_BATCH_BYTES // view_bytes, 1, n))  # views that are held at once
+    require(4 * grid.n_voxels + batch * view_bytes, f"a volume of {' x '.join(map(str, grid.shape))} voxels")
     volume = np.zeros(grid.shape, np.float32)
-    room = np.zeros((at_once, n_v + 2, matrix.shape[1] + 2, 1), np.float32)
-    inside = room[:, 1:-1, 1:-1, 0]
+    padded = np.zeros((batch, n_v + 2, matrix.shape[1] + 2, 1), np.float32)
+    filtered = padded[:, 1:-1, 1:-1, 0]
     planes = np.arange(grid.shape[2], dtype=np.float64)
     tell(progress, 0, n)
-    for first in range(0, n, at_once):
-        end = min(first + at_once, n)
+    for first in range(0, n, batch):
+        end = min(first + batch, n)
 
         def filter_view(m: int, first: int = first) -> None:
-            inside[m - first] = (images[m] * weights(m)).astype(np.float32, copy=False) @ matrix
+            filtered[m - first] = (images[m] * weights(m)).astype(np.float32, copy=False) @ matrix
 
         run_all(filter_view, range(first, end), thread_count(None))
-        taken = room[: end - first], of_place[first:end]
-        gather(volume, planes, *taken, flat=True, by_depth=True, nearest=_BEHIND)
+        views_now = padded[: end - first], maps[first:end]
+        gather(volume, planes, *views_now, flat=True, by_depth=True, nearest=_NEAREST_DEPTH)
         tell(progress, end, n)
     return volume
 
 
-def _columns_beyond(matrices: Array, grid: Grid, n_u: int) -> int:
-    """Columns by which voxels lie beside the images, at most as many as these have.
+def _margin_columns(matrices: Array, grid: Grid, n_u: int) -> int:
+    """Return by how many columns, at most n_u, the voxels' images reach beyond the images' edges.
 
-    There filtered images are not 0, and an object that lies within the images has values around it that cancel out.
+    Filtered images are not 0 beyond their edges, and only with these values do the values around an object cancel out.
     """
     column, _, depth = np.einsum("mij,pj->imp", matrices, np.insert(grid.corners(), 3, 1.0, axis=1))
     if (depth < 1e-3).any():
@@ -130,24 +139,25 @@ def _columns_beyond(matrices: Array, grid: Grid, n_u: int) -> int:
 
 
 def angular_weights(angles: Array, turn: float) -> tuple[Array, float, float]:
-    """How much of a circle of circumference `turn` each angle stands for (M,): half the way to both neighbours.
+    """Return the angular weights (M,) of views on a circle of circumference `turn`, the first angle, and the gap.
 
-    Equal angles share alike what one of them would stand for. Then the first angle after the largest gap, and that gap, if
-    there is one: a gap that is large and far larger than most of the others is an end and a beginning, and not half of it is
-    added to these. Else the gap is 0.
+    A view's weight is half the angle to both of its neighbours; views at equal angles share one weight equally. If the
+    largest gap is large, and far larger than the median gap, the views lie on an arc: the gap is the arc's opening, the
+    first angle is the arc's beginning, and the views at both ends are weighted as if the median gap followed. Otherwise the
+    gap is 0 and the first angle is the one after the largest gap.
     """
     order = np.argsort(angles % turn, kind="stable")
     angles = (angles % turn)[order]
-    gaps = np.diff(angles, append=angles[0] + turn)  # from each to the next
-    is_first = np.roll(gaps, 1) > _EQUAL * turn  # of equal ones
-    which = np.cumsum(is_first) % is_first.sum()
+    gaps = np.diff(angles, append=angles[0] + turn)  # from each angle to the next
+    is_new = np.roll(gaps, 1) > _ANGLE_TOLERANCE * turn  # whether an angle differs from the angle before it
+    group = np.cumsum(is_new) % is_new.sum()  # index of each angle's group of equal angles
     widest = int(gaps.argmax())
-    gap, others = float(gaps[widest]), np.sort(np.delete(gaps, widest))
-    usual = float(others[np.searchsorted(others.cumsum(), others.sum() / 2)])  # half of the rest is in gaps as large
-    if gap > max(_SMALL_GAP, _OUTSTANDING * usual):
-        gaps[widest] = usual
+    gap, other_gaps = float(gaps[widest]), np.sort(np.delete(gaps, widest))
+    median = float(other_gaps[np.searchsorted(other_gaps.cumsum(), other_gaps.sum() / 2)])  # weighted by the gaps
+    if gap > max(_SMALL_GAP, _GAP_FACTOR * median):
+        gaps[widest] = median
     else:
         gap = 0.0
-    shares = np.empty(len(angles))
-    shares[order] = (np.bincount(which, (gaps + np.roll(gaps, 1)) / 2) / np.bincount(which))[which]
-    return shares, float(angles[(widest + 1) % len(angles)]), gap
+    weights = np.empty(len(angles))
+    weights[order] = (np.bincount(group, (gaps + np.roll(gaps, 1)) / 2) / np.bincount(group))[group]
+    return weights, float(angles[(widest + 1) % len(angles)]), gap

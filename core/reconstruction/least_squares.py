@@ -1,4 +1,4 @@
-"""Least squares by iteration: SIRT and CGLS, and what they have in common with TV."""
+"""Iterative least squares: SIRT and CGLS, and the loop that TV and OSTR share with them."""
 
 from typing import Any, Unpack
 
@@ -9,16 +9,22 @@ from ..errors import InputError, warn
 from ..progress import Progress, tell
 from ..projector import Projector
 from ..validation import instance, positive, real_array
-from .loop import IterativeOptions, Loop, plain, waiting
+from .arguments import argument
+from .loop import IterativeOptions, Loop, fixed_progress, numpy_if_tensor
 from .result import Reconstruction
 
-_LEAN = 0.05
-"""Cosine between a gradient of CGLS and its first, 0 in exact numbers: below it volumes are within 1e-3 of theirs."""
-_DONE = 1e-6
-"""The share of the first gradient that is left at the least squares in single precision."""
-_LEANS = "CGLS: from iteration {} on rounding puts its volumes up to a few percent beside those of exact numbers"
+_MAX_COSINE = 0.05
+"""Cosine between a gradient of CGLS and the first gradient, 0 in exact arithmetic, above which rounding matters.
+
+Below it the volumes are within 1e-3 of those of exact arithmetic.
+"""
+_CONVERGED = 1e-6
+"""Ratio of the last and the first gradient at the least-squares solution in single precision."""
+_ROUNDING_WARNING = "CGLS: from iteration {} on rounding changes the volumes by up to a few percent"
 
 
+@argument("relaxation", float, "Length of the steps, less than 2", above=0, slider=1.9)
+@argument("nonnegative", bool, "Set values below 0 to 0")
 def sirt(
     A: Projector,
     images: ArrayLike,
@@ -28,37 +34,37 @@ def sirt(
     *options: Any,
     **named: Unpack[IterativeOptions],
 ) -> Reconstruction:
-    """The volume whose images are nearest to `images`, by SIRT: ``x <- x + relaxation C A.T(R (images - A x))``.
+    """Reconstruct a volume by weighted least squares with SIRT: ``x <- x + relaxation C A.T(R (images - A x))``.
 
-    R is 1 by the pixels' sums of weights, ``A(1)``, C 1 by the voxels', ``A.T(1)``. Early iterations are smooth, later ones
-    sharper and noisier. Slow and steady; for any projector.
+    R is ``1 / A(1)``, the inverse of each pixel's sum of weights, and C is ``1 / A.T(1)``, that of each voxel. Early
+    iterations are smooth, later ones sharper and noisier. The method is slow and robust, and works with any projector.
 
     Parameters
     ----------
     A : Projector
-        A projector of any model. Its background, if it has any, is taken off the images.
+        Projector of any model. The background of the model, if any, is subtracted from the images.
     images : array (M, n_v, n_u)
         Line integrals of `Transmission`, or counts of `Emission`.
     iterations : int
-        Each takes one projection and one backprojection.
+        Number of iterations of this call, of one projection and one backprojection each.
     relaxation : float
         Length of the steps, more than 0 and less than 2.
     nonnegative : bool
-        Whether values below 0 become 0 after each step.
+        Whether values below 0 are set to 0 after each step.
     *options, **named
-        See `IterativeOptions`. Without `start` it begins with 0 everywhere.
+        See `IterativeOptions`. Without `start` every voxel begins with 0.
 
     Returns
     -------
     Reconstruction
         `objective` is half the sum of squares of ``images - A x``, weighted with R, after each iteration; it never rises.
-        Pixels whose rays miss the grid count nothing, voxels that no ray meets stay as they are. The volume is of mu for
-        projectors of line integrals, else of activity, unless `start` is of another quantity.
+        Pixels whose rays miss the grid are ignored; voxels that no ray meets keep their values. The volume holds mu for
+        projectors of line integrals, otherwise activity, unless `start` is a volume of another quantity.
 
     Raises
     ------
     InputError
-        Images, start or mask have another shape, or are not finite; a number is out of its range.
+        Images, start or mask have another shape, or are not finite; a number is out of range.
 
     References
     ----------
@@ -70,18 +76,18 @@ def sirt(
     if relaxation >= 2:
         raise InputError(f"relaxation: expected less than 2, got {relaxation:g}")
     loop = LeastSquaresLoop("SIRT", A, images, iterations, nonnegative, *options, **named)
-    per_pixel = inverse(loop.forward(loop.weights, loop.preparing()))
-    per_voxel = np.float32(relaxation) * inverse(loop.adjoint(np.ones(A.shape_out, np.float32), loop.preparing()))
+    R = safe_inverse(loop.forward(loop.weights, loop.preparing()))
+    C = np.float32(relaxation) * safe_inverse(loop.adjoint(np.ones(A.shape_out, np.float32), loop.preparing()))
     residual: Array | None = None
 
     def step(number: int, x: Array, progress: Progress | None) -> tuple[Array, float]:
         nonlocal residual
         if residual is None:
-            residual = loop.images - loop.forward(x, waiting(progress, 0, 2))
-        x = loop.bounded(x + per_voxel * loop.adjoint(per_pixel * residual, waiting(progress, 0, 2)))
-        residual = loop.images - loop.forward(x, waiting(progress, 1, 2))
+            residual = loop.images - loop.forward(x, fixed_progress(progress, 0, 2))
+        x = loop.bounded(x + C * loop.adjoint(R * residual, fixed_progress(progress, 0, 2)))
+        residual = loop.images - loop.forward(x, fixed_progress(progress, 1, 2))
         tell(progress, 2, 2)
-        return x, 0.5 * float(np.sum(per_pixel * np.square(residual, dtype=float)))
+        return x, 0.5 * float(np.sum(R * np.square(residual, dtype=float)))
 
     return loop.run(step, relaxation=relaxation, nonnegative=nonnegative)
 
@@ -89,14 +95,14 @@ def sirt(
 def cgls(
     A: Projector, images: ArrayLike, iterations: int = 10, *options: Any, **named: Unpack[IterativeOptions]
 ) -> Reconstruction:
-    """The volume whose images are nearest to `images`, by conjugate gradients on the normal equations (CGLS).
+    """Reconstruct a volume by least squares with conjugate gradients on the normal equations (CGLS).
 
-    The fastest way to the least squares, whose values may be negative. It ends early where there is noise: about 5 to 20
-    iterations are as sharp as hundreds of `sirt`.
+    This is the fastest method for the least-squares solution, whose values may be negative. With noise it should be ended
+    early: about 5 to 20 iterations are as sharp as hundreds of `sirt`.
 
-    Its gradients are at right angles to each other. Rounding makes those that come late lean to the first, and from then on,
-    often after 10 to 15 iterations, the volumes are not those of exact numbers, but a few percent beside them; they go on
-    towards the same least squares. A warning says where (Paige 1980; in double precision the same happens later).
+    In exact arithmetic its gradients are orthogonal. Rounding destroys this orthogonality, often after 10 to 15 iterations;
+    from then on the volumes differ by a few percent from those of exact arithmetic, but still converge to the same
+    least-squares solution. A warning names the iteration (Paige 1980; in double precision it happens later).
 
     Parameters
     ----------
@@ -116,7 +122,7 @@ def cgls(
     Warns
     -----
     InputWarning
-        Rounding turns it off the way of exact numbers: up to there it keeps to them within 1e-3.
+        From the named iteration on, rounding changes the volumes; up to there they are exact within 1e-3.
 
     References
     ----------
@@ -128,34 +134,34 @@ def cgls(
 
     def step(number: int, x: Array, progress: Progress | None) -> tuple[Array, float]:
         if not loop.state:
-            residual: Array = loop.images - loop.forward(x, waiting(progress, 0, 2))
-            direction = loop.adjoint(residual, waiting(progress, 0, 2))
-            loop.state = {"residual": residual, "direction": direction, "gradient": _squares(direction)}
-        residual, direction, before = (loop.state[name] for name in ("residual", "direction", "gradient"))
+            residual: Array = loop.images - loop.forward(x, fixed_progress(progress, 0, 2))
+            direction = loop.adjoint(residual, fixed_progress(progress, 0, 2))
+            loop.state = {"residual": residual, "direction": direction, "gradient": _sum_of_squares(direction)}
+        residual, direction, gradient_squares = (loop.state[name] for name in ("residual", "direction", "gradient"))
         first = loop.state.setdefault("first", direction)
-        change = loop.forward(direction, waiting(progress, 0, 2))
-        length = _squares(change)
-        if length > 0:  # else the least squares are reached
-            share = (before / length).astype(np.float32)
-            x = x + share * direction
-            residual = residual - share * change
-            gradient = loop.adjoint(residual, waiting(progress, 1, 2))
-            after = _squares(gradient)
-            direction = gradient + (after / before).astype(np.float32) * direction
-            loop.state |= {"residual": residual, "direction": direction, "gradient": after}
-            first_squares = _squares(first)
-            leans = float(np.vdot(first, gradient)) ** 2 > _LEAN**2 * after * first_squares
-            if leans and after > _DONE**2 * first_squares:
-                loop.state["first"] = np.zeros_like(first)  # the warning is given once
-                warn(_LEANS.format(number + 1), 2)
+        direction_images = loop.forward(direction, fixed_progress(progress, 0, 2))
+        image_squares = _sum_of_squares(direction_images)
+        if image_squares > 0:  # else the volume is the least-squares solution
+            length = (gradient_squares / image_squares).astype(np.float32)
+            x = x + length * direction
+            residual = residual - length * direction_images
+            gradient = loop.adjoint(residual, fixed_progress(progress, 1, 2))
+            new_squares = _sum_of_squares(gradient)
+            direction = gradient + (new_squares / gradient_squares).astype(np.float32) * direction
+            loop.state |= {"residual": residual, "direction": direction, "gradient": new_squares}
+            first_squares = _sum_of_squares(first)
+            is_oblique = float(np.vdot(first, gradient)) ** 2 > _MAX_COSINE**2 * new_squares * first_squares
+            if is_oblique and new_squares > _CONVERGED**2 * first_squares:
+                loop.state["first"] = np.zeros_like(first)  # so that the warning is given once
+                warn(_ROUNDING_WARNING.format(number + 1), 2)
         tell(progress, 2, 2)
-        return x, 0.5 * float(_squares(residual))
+        return x, 0.5 * float(_sum_of_squares(residual))
 
     return loop.run(step)
 
 
 class LeastSquaresLoop(Loop):
-    """The iterations of a method that finds x with ``A x`` near images: a `Loop` that knows them and begins with 0.
+    """Loop of a method that minimises a distance between ``A x`` and images: a `Loop` with the images, from 0 on.
 
     Parameters
     ----------
@@ -167,9 +173,9 @@ class LeastSquaresLoop(Loop):
     Attributes
     ----------
     images : array (M, n_v, n_u)
-        What was measured, without the model's background; 0 in pixels that are dead in the model, which so are left out.
+        Measured images minus the model's background; 0 in pixels that are dead in the model.
     weights : array (n_x, n_y, n_z)
-        1 inside the mask, else 0.
+        1 inside the mask, 0 outside.
     """
 
     def __init__(
@@ -190,35 +196,36 @@ class LeastSquaresLoop(Loop):
         )
         self._nonnegative = nonnegative
         background = A.background.astype(np.float32)
-        measured = real_array(plain(images), "images", A.shape_out, np.float32) - background
+        measured = real_array(numpy_if_tensor(images), "images", A.shape_out, np.float32) - background
         self.images: Array = np.where(A.living, measured, np.float32(0))
         self.weights: Array = self.mask.astype(np.float32)
 
     def record(self) -> dict[str, Any]:
-        """The model, and sums of views, images and mask that depend on their order."""
-        all_of = {"views": self._A.views.projection_matrices(), "images": self.images, "mask": self.weights}
-        sums = {name: numbers.sum(axis=(1, 2), dtype=float) for name, numbers in all_of.items()}
-        known = {name: float(of_each @ np.linspace(1.0, 2.0, len(of_each))) for name, of_each in sums.items()}
-        return {"model": self._A.model.name, **known}
+        """Return the model's name, and weighted sums of views, images and mask, which change with the order of the views."""
+        arrays = {"views": self._A.views.projection_matrices(), "images": self.images, "mask": self.weights}
+        sums = {name: numbers.sum(axis=(1, 2), dtype=float) for name, numbers in arrays.items()}
+        checksums = {name: float(numbers @ np.linspace(1.0, 2.0, len(numbers))) for name, numbers in sums.items()}
+        return {"model": self._A.model.name, **checksums}
 
     def forward(self, x: Array, progress: Progress | None) -> Array:
-        """``A x``, float32."""
+        """Return ``A x``, float32 (M, n_v, n_u)."""
         return np.asarray(self._A(x, progress), np.float32)
 
     def adjoint(self, y: Array, progress: Progress | None) -> Array:
-        """``A.T y`` inside the mask, float32."""
+        """Return ``A.T y`` inside the mask and 0 outside, float32 (n_x, n_y, n_z)."""
         return np.asarray(self._A.T(y, progress), np.float32) * self.weights
 
     def bounded(self, x: Array) -> Array:
-        """`x`, at least 0 where no negative values are wanted."""
+        """Return ``max(x, 0)`` if the method allows no negative values, otherwise `x`."""
         return np.maximum(x, np.float32(0)) if self._nonnegative else x
 
 
-def inverse(sums: Array) -> Array:
-    """1 divided by sums of weights; 0 where there are none, or next to none beside the others."""
-    least = 1e-6 * sums.max(initial=0.0)
-    return np.divide(1, sums, out=np.zeros_like(sums), where=sums > least)
+def safe_inverse(sums: Array) -> Array:
+    """Return ``1 / sums``; 0 where a sum is at most 1e-6 of the largest."""
+    smallest = 1e-6 * sums.max(initial=0.0)
+    return np.divide(1, sums, out=np.zeros_like(sums), where=sums > smallest)
 
 
-def _squares(numbers: Array) -> Array:
+def _sum_of_squares(numbers: Array) -> Array:
+    """Return the sum of squares of all numbers, as a float64 array without axes."""
     return np.asarray(np.sum(np.square(numbers, dtype=float)))

@@ -1,4 +1,4 @@
-"""The loop of all iterative reconstructions: start and resume, log, callback, progress, cancelling and stopping."""
+"""Loop of all iterative reconstructions: start and resume, record of the objective, callback, progress, stopping."""
 
 import math
 import time
@@ -14,36 +14,37 @@ from ..projector import Projector
 from ..validation import freeze, instance, real_array, whole_number
 from ..volumes.volume import Volume
 from .result import Callback, Reconstruction
-from .stopping import StoppingRule, StopWhen, inside
+from .stopping import StoppingRule, StopWhen, checked_mask
 
 Start = Volume | Reconstruction | ArrayLike | None
 
 Step = Callable[[int, Array, Progress | None], tuple[Array, float]]
-"""One iteration: ``values, objective = step(number, values, progress)``.
+"""Function that does one iteration: ``new_values, objective = step(number, values, progress)``.
 
-`number` counts from 0, those before a resume included. The values given are read-only, those returned new. `progress` is the
-iteration's own: call it as ``progress(done, total)``, the last time with done = total.
+`number` is the iteration's index from 0, iterations before a resume included. `values` are read-only; the returned values
+are a new array. `progress` reports on this iteration alone: call it as ``progress(done, total)``, at last with done = total.
 """
 
 
 class IterativeOptions(TypedDict, total=False):
-    """The arguments that every iterative method takes after its own, by name, or by position in this order.
+    """Arguments that every iterative method takes after its own arguments, by name, or by position in this order.
 
     Attributes
     ----------
     start : Volume, Reconstruction, array or tensor, optional
-        What the volume begins with, on the projector's grid; by default the same value everywhere. A reconstruction by the
-        same method goes on with the same numbers as without a break, its log too; all other arguments must be what they
-        were, but for `iterations`, which are done in addition. Of one by another method the volume is taken.
+        Initial volume on the projector's grid; by default the same value in all voxels. A `Reconstruction` by the same
+        method is resumed: values and objective continue as without a break. All other arguments must then be the same as in
+        its call, except `iterations`, which are done in addition. Of a reconstruction by another method only the volume is
+        used.
     mask : array of bool, optional
-        It has the grid's shape; outside it the volume is 0.
+        Voxels that are reconstructed, in the grid's shape; outside the mask the volume is 0.
     callback : callable, optional
-        See `Callback`.
+        Function that is called after each iteration, see `Callback`.
     progress : callable, optional
-        Called as ``progress(updates done, updates)``; what it raises stops the work. A `Cancelled` has what was done before
-        as its `reconstruction`.
+        Called as ``progress(updates done, updates)``; an exception that it raises stops the reconstruction. A `Cancelled`
+        carries the iterations that were finished as its attribute `reconstruction`.
     stop : StoppingRule, optional
-        A rule that ends the work before the last iteration, such as `StopWhen`.
+        Rule that ends the reconstruction before the last iteration, such as `StopWhen`.
     """
 
     start: Start
@@ -54,12 +55,12 @@ class IterativeOptions(TypedDict, total=False):
 
 
 class Loop:
-    """The iterations of one call of a method. Arguments are checked when it is made.
+    """Iterations of one call of a method, with checked arguments.
 
     ::
 
         loop = Loop("SIRT", A, iterations, *options, **named, default=0.0, negative=True)
-        weights = A.T(...)                              # what the method prepares
+        weights = A.T(...)                              # arrays that the method prepares
 
         def step(number, values, progress):
             ...
@@ -70,30 +71,32 @@ class Loop:
     Parameters
     ----------
     method : str
-        The method's name, for settings and messages. A `Reconstruction` of this method is resumed; of another, its volume is
-        the start of a new one.
+        Name of the method in settings and messages. A `Reconstruction` of the same method is resumed; the volume of another
+        method's reconstruction is the start of a new one.
     A : Projector
+        Projector from the volume's grid to the images.
     iterations : int
-        How many are done in this call.
+        Number of iterations of this call.
     start, mask, callback, progress, stop
         See `IterativeOptions`.
     default : float
-        The value that voxels begin with where there is no `start`.
+        Initial value of all voxels if there is no `start`.
     negative : bool
         Whether values may be below 0.
     quantity : str
-        What the resulting volume is of, unless `start` is a volume.
+        Quantity of the resulting volume, unless `start` is a volume.
 
     Attributes
     ----------
     values : array (n_x, n_y, n_z)
-        To begin with, float32; 0 outside the mask.
-    is_given : bool
+        Current values of the volume, float32; 0 outside the mask.
+    has_start : bool
         Whether there is a `start`.
-    mask : array of bool
+    mask : array of bool (n_x, n_y, n_z)
+        Voxels that are reconstructed.
     state : dict of arrays
-        What a method needs besides the values to be resumed. `run` keeps it with the result; a resumed one finds here
-        what its last iteration had put in, else it is empty. Steps replace its arrays, and do not change their numbers.
+        Arrays by name that the method needs besides the values to be resumed. It is empty at first; in a resumed
+        reconstruction it has the arrays of the last iteration. Steps replace the arrays, and never change them in place.
     """
 
     def __init__(
@@ -112,7 +115,7 @@ class Loop:
         quantity: str = "activity",
     ) -> None:
         instance(A, Projector, method)
-        self._begun = time.monotonic()
+        self._start_time = time.monotonic()
         self._method, self._A, self._callback, self._progress, self._stop = method, A, callback, progress, stop
         for name, function in (("callback", callback), ("progress", progress)):
             if function is not None and not callable(function):
@@ -120,60 +123,60 @@ class Loop:
         self._iterations = whole_number(iterations, "iterations")
         if stop is not None:
             if not isinstance(stop, StoppingRule):
-                instance(stop, StopWhen, "stop")  # the rule that users know
+                instance(stop, StopWhen, "stop")  # the message names the rule that users know
             stop.check(A.shape_in)
-        self.mask = np.ones(A.shape_in, bool) if mask is None else inside(mask, "mask", A.shape_in)
+        self.mask = np.ones(A.shape_in, bool) if mask is None else checked_mask(mask, "mask", A.shape_in)
         if not self.mask.any():
             warn(f"mask: 0 of {self.mask.size} voxels are inside: the volume will be 0", 4)
         self.state: dict[str, Array] = {}
         self._objective: list[float] = []
-        self._resumed: Mapping[str, Any] = {}  # the settings of what is resumed
+        self._resumed: Mapping[str, Any] = {}  # settings of the resumed reconstruction
         if isinstance(start, Reconstruction):
             if start.settings.get("method") == method:
                 self.state, self._objective = dict(start.state), [float(number) for number in start.objective]
                 self._resumed = start.settings
             start = start.volume
-        self.is_given = start is not None
+        self.has_start = start is not None
         self._quantity = start.quantity if isinstance(start, Volume) else quantity
         self.values = self._first_values(start, default, negative)
 
     @property
-    def done(self) -> int:
-        """Iterations done, those before a resume included."""
+    def n_done(self) -> int:
+        """Number of finished iterations, those before a resume included."""
         return len(self._objective)
 
     def preparing(self) -> Progress | None:
-        """The progress callback for what is prepared before the first iteration: it only asks whether to go on."""
-        return waiting(self._progress, 0, self._iterations)
+        """Return the progress callback for the work before the first iteration, during which the progress stays at 0."""
+        return fixed_progress(self._progress, 0, self._iterations)
 
     def record(self) -> dict[str, Any]:
-        """What the data are known by when a reconstruction is resumed: entries of its settings."""
+        """Return numbers that identify the data, as settings: a resumed reconstruction must have the same numbers."""
         return {}
 
     def objective(self, values: Array, progress: Progress | None) -> float | None:
-        """The objective of any volume, if a method can say it without a step."""
+        """Return the objective of a volume, or None if the method cannot compute it without a step."""
         return None
 
     def run(self, step: Step, **settings: Any) -> Reconstruction:
-        """Do the iterations; `settings` are the method's own arguments.
+        """Do the iterations and return the reconstruction; `settings` are the arguments of the method.
 
-        Where a reconstruction is resumed, they, the `record` of the data and the objective of the volume must be what they
-        were, else `InputError`. A `Cancelled` of progress or callback takes along what was done before, as its
+        Raise `InputError` if a resumed reconstruction has other settings, another `record` of the data or another objective
+        of its volume. A `Cancelled` that progress or callback raises gets the iterations that were finished as its attribute
         `reconstruction`.
         """
         settings |= self.record()
         result = self._result(settings, "cancelled")
         try:
             if self._objective:
-                self._require_as_before(settings, self.objective(self.values, self.preparing()))
+                self._require_same(settings, self.objective(self.values, self.preparing()))
             for i in range(self._iterations):
-                values, reached = step(self.done, self.values, part_of(self._progress, i, self._iterations))
-                self.values = self._inside(values)
-                self._objective.append(float(reached))
+                values, objective = step(self.n_done, self.values, part_of(self._progress, i, self._iterations))
+                self.values = self._masked(values)
+                self._objective.append(float(objective))
                 result = self._result(settings, "cancelled")
-                if self._callback is not None and self._callback(self.done, self.values):
+                if self._callback is not None and self._callback(self.n_done, self.values):
                     return self._result(settings, "callback")
-                seconds = time.monotonic() - self._begun
+                seconds = time.monotonic() - self._start_time
                 reason = self._stop and self._stop.reason(self._objective, self.values, seconds)
                 if reason:
                     return self._result(settings, reason)
@@ -182,11 +185,12 @@ class Loop:
             raise
         return self._result(settings, "iterations")
 
-    def _require_as_before(self, settings: Mapping[str, Any], objective: float | None) -> None:
+    def _require_same(self, settings: Mapping[str, Any], objective: float | None) -> None:
+        """Raise `InputError` unless settings and objective are those of the resumed reconstruction."""
         last = self._objective[-1]
-        known = {**settings, **self._resumed, "objective": last}
-        asked = {**settings, "objective": last if objective is None else objective}
-        changed = [f"{key} {known[key]}, now {new}" for key, new in asked.items() if not _same(new, known[key])]
+        expected = {**settings, **self._resumed, "objective": last}
+        present = {**settings, "objective": last if objective is None else objective}
+        changed = [f"{key} {expected[key]}, now {v}" for key, v in present.items() if not _are_equal(v, expected[key])]
         if changed:
             raise InputError(
                 "start: this reconstruction is of other images, views or mask, or another model or other settings "
@@ -195,33 +199,35 @@ class Loop:
 
     def _result(self, settings: Mapping[str, Any], stopped: str) -> Reconstruction:
         volume = Volume(self.values, self._A.grid, self._quantity)
-        known = {"method": self._method, **settings, "iterations": self.done, "stopped": stopped}
-        return Reconstruction(volume, np.array(self._objective), known, dict(self.state))
+        settings = {"method": self._method, **settings, "iterations": self.n_done, "stopped": stopped}
+        return Reconstruction(volume, np.array(self._objective), settings, dict(self.state))
 
     def _first_values(self, start: Volume | ArrayLike | None, default: float, negative: bool) -> Array:
+        """Return the checked values of `start`, or `default` in all voxels, with 0 outside the mask."""
         if start is None:
-            return self._inside(np.full(self._A.shape_in, default, np.float32))
+            return self._masked(np.full(self._A.shape_in, default, np.float32))
         with naming("start"):
-            array = self._A._check(start) if isinstance(start, Volume) else plain(start)
+            array = self._A._check(start) if isinstance(start, Volume) else numpy_if_tensor(start)
         values = real_array(array, "start", self._A.shape_in, np.float32)
         if not negative and values.min() < 0:
             raise InputError(f"start: expected 0 or more, got {values.min():g}")
-        return self._inside(values)
+        return self._masked(values)
 
-    def _inside(self, values: Array) -> Array:
+    def _masked(self, values: Array) -> Array:
+        """Return a read-only float32 copy of `values` with 0 outside the mask."""
         return freeze(np.ascontiguousarray(np.where(self.mask, np.asarray(values, np.float32), np.float32(0))))
 
 
-def _same(one: Any, other: Any) -> bool:
-    """Whether settings are equal, numbers but for the rounding by which backends differ."""
-    return bool(one == other) or (type(one) is type(other) is float and math.isclose(one, other, rel_tol=1e-7))
+def _are_equal(a: Any, b: Any) -> bool:
+    """Return whether two settings are equal; floats may differ by rounding, as between backends."""
+    return bool(a == b) or (type(a) is type(b) is float and math.isclose(a, b, rel_tol=1e-7))
 
 
-def waiting(progress: Progress | None, done: int, total: int) -> Progress | None:
-    """The progress callback of a part of a step: it says again how far the whole is, so that the part can be cancelled."""
+def fixed_progress(progress: Progress | None, done: int, total: int) -> Progress | None:
+    """Return a callback that calls ``progress(done, total)`` whatever its arguments, so that `progress` can cancel."""
     return None if progress is None else lambda *_: progress(done, total)
 
 
-def plain(numbers: Any) -> Any:
-    """A torch tensor, on any device, as a numpy array; anything else as it is."""
+def numpy_if_tensor(numbers: Any) -> Any:
+    """Return a torch tensor on any device as a numpy array; return anything else unchanged."""
     return to_numpy(numbers, None) if is_tensor(numbers) else numbers

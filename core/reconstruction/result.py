@@ -1,4 +1,4 @@
-"""What a reconstruction gives."""
+"""Result of an iterative reconstruction: the volume, the objective of each iteration, and the state for a resume."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -8,28 +8,31 @@ from ..arrays import Array, Floats
 from ..volumes.volume import Volume
 
 Callback = Callable[[int, Array], bool | None]
-"""Called as ``callback(iteration, values)`` after each iteration, counted from 1, with the volume's values, which cannot be
-changed; what is true ends the reconstruction. A resumed one counts on."""
+"""Function that is called as ``callback(iteration, values)`` after each iteration; returning a true value ends the work.
+
+`iteration` counts from 1, iterations before a resume included; `values` are the volume's values, read-only.
+"""
 
 
 @dataclass(frozen=True, eq=False)
 class Reconstruction:
-    """A reconstructed volume, and how it came about; as ``start=`` of the same algorithm it goes on where it ended."""
+    """Reconstructed volume with its history; as the argument ``start`` of the same method it is resumed."""
 
     volume: Volume
+    """Reconstructed volume."""
     objective: Floats
-    """What the method makes as large, or as small, as it can, after each iteration (n,); (0,) of a method without one."""
+    """Function that the method maximises or minimises, after each iteration (n,); (0,) for a method without one."""
     settings: Mapping[str, Any] = field(default_factory=dict)
-    """The method's name ("method"), its arguments, and why it ended ("stopped"): anything JSON can hold."""
+    """Method's name ("method"), its arguments, and the reason for its end ("stopped"), in types that JSON can hold."""
     state: Mapping[str, Array] = field(default_factory=dict)
-    """What else the method needs to go on as if it had not ended, by name; most need the volume alone."""
+    """Arrays by name that the method needs besides the volume to be resumed; empty for most methods."""
 
     @property
     def iterations(self) -> int:
-        """How many iterations were done, those before it was resumed included."""
+        """Number of finished iterations, those before a resume included."""
         return len(self.objective)
 
 
 def iterations_text(n: int) -> str:
-    """A number of iterations in words, nothing for 0."""
+    """Return a number of iterations as text, such as "3 iterations"; "" for 0."""
     return f"{n} iteration{'s' * (n > 1)}" if n else ""

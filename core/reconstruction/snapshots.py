@@ -1,4 +1,4 @@
-"""Volumes on the way of OSEM, of many scans by one scanner: what networks begin with, and baselines are chosen from."""
+"""OSEM volumes after several numbers of iterations, for many scans of one scanner: inputs and baselines of networks."""
 
 from collections.abc import Sequence
 
@@ -8,42 +8,44 @@ from ..arrays import Array
 from ..progress import Progress, tell
 from ..projector import Projector
 from ..projector.subsets import in_access_order
-from .counts import LEAST, CountData
+from .counts import NEGLIGIBLE, CountData
 
 
 class Snapshots:
-    """OSEM whose subsets and sensitivities are made once: the numbers of `osem`, without its objective and options.
+    """OSEM with subsets and sensitivities that are computed once: the updates of `osem`, without objective and options.
 
-    It begins with the even volume that gives as many counts, so that twice the counts and background give twice the volume.
+    The initial volume is uniform and has as many expected counts as were measured, so that the result is proportional to
+    counts and background.
 
     Parameters
     ----------
     A : Projector
-        Of emission.
+        Projector of emission.
     subsets : int
-        See `osem`.
+        Number of subsets, see `osem`.
     """
 
     def __init__(self, A: Projector, subsets: int) -> None:
-        self._A, self._parts = A, in_access_order(A.subsets(subsets))
-        self._seen = [np.asarray(part.T(np.ones(part.shape_out, np.float32))) for part in self._parts]
-        total = np.sum(self._seen, axis=0)
-        self._even = (total > LEAST) / total.sum(dtype=float)  # of one count
+        self._A, self._subsets = A, in_access_order(A.subsets(subsets))
+        self._sensitivities = [np.asarray(B.T(np.ones(B.shape_out, np.float32))) for B in self._subsets]
+        total = np.sum(self._sensitivities, axis=0)
+        self._uniform = (total > NEGLIGIBLE) / total.sum(dtype=float)  # uniform volume with one expected count
 
     def __call__(
-        self, counts: Array, after: Sequence[int], background: Array | float = 0.0, progress: Progress | None = None
+        self, counts: Array, numbers: Sequence[int], background: Array | float = 0.0, progress: Progress | None = None
     ) -> Array:
-        """The volumes (len(after), n_x, n_y, n_z) after so many iterations, in growing order.
+        """Return the volumes (n, n_x, n_y, n_z) after each of n `numbers` of iterations, in ascending order.
 
-        Counts (M, n_v, n_u) and background, all that is expected besides the volume, are of the projector's shape, float32.
+        `counts` are measured images (M, n_v, n_u), float32; `background` are the expected counts of each pixel that do not
+        come from the volume, the model's background included.
         """
-        data = CountData(counts, np.broadcast_to(np.float32(background), counts.shape)).living(self._A)
-        own = [data[part.which] for part in self._parts]
-        x, found = (data.counts.sum(dtype=float) * self._even).astype(np.float32), []
-        for number in range(1, max(after) + 1):
-            for part, measured, seen in zip(self._parts, own, self._seen, strict=True):
-                factor = part.T(measured.ratio(np.asarray(part(x))))
-                x = x * np.divide(factor, seen, out=np.ones_like(x), where=seen > LEAST)
-            found += [x] * (number in after)
-            tell(progress, number, max(after))
-        return np.stack(found)
+        data = CountData(counts, np.broadcast_to(np.float32(background), counts.shape)).without_dead_pixels(self._A)
+        subset_data = [data[projector.which] for projector in self._subsets]
+        x, volumes = (data.counts.sum(dtype=float) * self._uniform).astype(np.float32), []
+        for number in range(1, max(numbers) + 1):
+            for projector, measured, sensitivity in zip(self._subsets, subset_data, self._sensitivities, strict=True):
+                factor = projector.T(measured.ratio(np.asarray(projector(x))))
+                x = x * np.divide(factor, sensitivity, out=np.ones_like(x), where=sensitivity > NEGLIGIBLE)
+            volumes += [x] * (number in numbers)
+            tell(progress, number, max(numbers))
+        return np.stack(volumes)

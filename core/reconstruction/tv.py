@@ -1,4 +1,4 @@
-"""Least squares with total variation, by a primal-dual algorithm."""
+"""Least squares with total variation, minimised by a primal-dual algorithm: TV."""
 
 from typing import Any, Unpack
 
@@ -10,8 +10,8 @@ from ..memory import require
 from ..progress import Progress, tell
 from ..projector import Projector
 from ..validation import positive
-from .least_squares import LeastSquaresLoop, inverse
-from .loop import IterativeOptions, waiting
+from .least_squares import LeastSquaresLoop, safe_inverse
+from .loop import IterativeOptions, fixed_progress
 from .result import Reconstruction
 
 
@@ -24,24 +24,24 @@ def tv(
     *options: Any,
     **named: Unpack[IterativeOptions],
 ) -> Reconstruction:
-    """The volume with the least ``||A x - images||^2 / 2 + weight TV(x)``: areas of one value with sharp edges.
+    """Reconstruct the volume that minimises ``||A x - images||^2 / 2 + weight TV(x)``: uniform areas with sharp edges.
 
-    TV, the total variation, sums the size of the gradient over the voxels: the root of the squared differences to the next
-    voxel along each axis, by the axis's spacing in units of the smallest. Differences count between voxels that are both in
-    the mask and met by rays. It makes up for views that are few or noisy.
+    The total variation TV is the sum over voxels of the gradient's length: the root of the squared differences to the next
+    voxel along each axis, divided by the axis's spacing in units of the smallest spacing. Only differences between voxels in
+    the mask that rays meet are taken into account. The method is for few or noisy views.
 
     Parameters
     ----------
     weight : float
-        How much the variation counts, more than 0, in units of the images squared by the volume's values; too much makes all
-        one value.
+        Weight of the total variation, more than 0, in units of squared image values by volume values; too large a weight
+        makes the volume uniform.
     A, images, iterations, nonnegative, *options, **named
         See `sirt`.
 
     Returns
     -------
     Reconstruction
-        `objective` is what is made least, after each iteration. It goes down with small ups in between.
+        `objective` is the minimised function after each iteration. It falls, with small rises in between.
 
     Raises
     ------
@@ -60,51 +60,53 @@ def tv(
     weight = positive(weight, "weight")
     require(4 * (30 * A.grid.n_voxels + 5 * int(np.prod(A.shape_out))), "the arrays of tv")
     closeness = A.grid.spacing.min() / A.grid.spacing
-    per_pixel = inverse(loop.forward(loop.weights, loop.preparing()))
-    weights = loop.adjoint(np.ones(A.shape_out, np.float32), loop.preparing())
-    is_seen = (weights > 0).astype(np.float32)
-    pairs = (_gradient(is_seen, np.ones(3, np.float32)) == 0) * is_seen  # 1 where a voxel and the next one are seen
-    # The gradient is scaled so that it has as much weight in a voxel as its rays have.
-    scale = float(weights.mean()) / max(float(loop.weights.mean()), 1e-6) / float(2 * closeness.sum()) or 1.0
+    pixel_steps = safe_inverse(loop.forward(loop.weights, loop.preparing()))  # dual step lengths of the images
+    sensitivity = loop.adjoint(np.ones(A.shape_out, np.float32), loop.preparing())
+    visible = (sensitivity > 0).astype(np.float32)
+    pairs = (_gradient(visible, np.ones(3, np.float32)) == 0) * visible  # 1 where a voxel and the next one are visible
+    # The gradient is scaled so that it has the same weight in a voxel as the voxel's rays.
+    scale = float(sensitivity.mean()) / max(float(loop.weights.mean()), 1e-6) / float(2 * closeness.sum()) or 1.0
     factors = (scale * closeness).astype(np.float32)
-    per_voxel = inverse(weights + np.float32(2 * factors.sum()) * loop.weights)
-    per_gradient = np.float32(1 / (2 * factors.max()))
+    voxel_steps = safe_inverse(sensitivity + np.float32(2 * factors.sum()) * loop.weights)  # primal step lengths
+    gradient_step = np.float32(1 / (2 * factors.max()))  # dual step length of the gradient
     radius = np.float32(weight / scale)
 
     def step(number: int, x: Array, progress: Progress | None) -> tuple[Array, float]:
+        # The state's keys are those of resumable files: images A x, extrapolated images and volume ("ahead", "beyond"), and
+        # the dual variables of images and gradient ("misfit", "slopes").
         if not loop.state:
-            seen = loop.forward(x, waiting(progress, 0, 2))
-            nothing = np.zeros((3, *x.shape), np.float32)
-            loop.state = {"seen": seen, "ahead": seen, "beyond": x, "misfit": np.zeros_like(seen), "slopes": nothing}
-        seen, ahead, beyond, misfit, slopes = (loop.state[s] for s in ("seen", "ahead", "beyond", "misfit", "slopes"))
-        misfit = (misfit + per_pixel * (ahead - loop.images)) / (1 + per_pixel)
-        slopes = pairs * (slopes + per_gradient * _gradient(beyond, factors))
+            images = loop.forward(x, fixed_progress(progress, 0, 2))
+            zeros = np.zeros_like(images), np.zeros((3, *x.shape), np.float32)
+            loop.state = {"seen": images, "ahead": images, "beyond": x, "misfit": zeros[0], "slopes": zeros[1]}
+        images, ahead, beyond, misfit, slopes = (loop.state[s] for s in ("seen", "ahead", "beyond", "misfit", "slopes"))
+        misfit = (misfit + pixel_steps * (ahead - loop.images)) / (1 + pixel_steps)
+        slopes = pairs * (slopes + gradient_step * _gradient(beyond, factors))
         slopes /= np.maximum(1, np.sqrt(np.sum(slopes**2, axis=0)) / radius)
-        back = loop.adjoint(misfit, waiting(progress, 0, 2)) + _gradient_adjoint(slopes, factors)
-        new = loop.bounded(x - per_voxel * back)
-        now = loop.forward(new, waiting(progress, 1, 2))
-        ahead, beyond = 2 * now - seen, 2 * new - x
-        loop.state = {"seen": now, "ahead": ahead, "beyond": beyond, "misfit": misfit, "slopes": slopes}
+        gradient = loop.adjoint(misfit, fixed_progress(progress, 0, 2)) + _gradient_adjoint(slopes, factors)
+        new = loop.bounded(x - voxel_steps * gradient)
+        new_images = loop.forward(new, fixed_progress(progress, 1, 2))
+        ahead, beyond = 2 * new_images - images, 2 * new - x
+        loop.state = {"seen": new_images, "ahead": ahead, "beyond": beyond, "misfit": misfit, "slopes": slopes}
         tell(progress, 2, 2)
-        squares = float(np.sum(np.square(now - loop.images, dtype=float)))
+        squares = float(np.sum(np.square(new_images - loop.images, dtype=float)))
         return new, 0.5 * squares + weight * total_variation(new, A.grid, pairs)
 
     return loop.run(step, weight=weight, nonnegative=nonnegative)
 
 
 def total_variation(x: Array, grid: Grid, pairs: Array | float = 1.0) -> float:
-    """Sum of the sizes of the gradient of `x`, as `tv` defines them; `pairs` (3, ...) are 0 where they do not count."""
+    """Return the total variation of `x` as `tv` defines it; `pairs` (3, ...) are 0 at differences to leave out."""
     slopes = pairs * _gradient(x.astype(np.float64), grid.spacing.min() / grid.spacing)
     return float(np.sum(np.sqrt(np.sum(slopes**2, axis=0))))
 
 
 def _gradient(x: Array, factors: Array) -> Array:
-    """Differences to the next voxel along each axis, times the axis's factor, (3, ...); 0 at the end."""
+    """Return the differences (3, ...) to the next voxel along each axis times the axis's factor; 0 in the last voxel."""
     ends = [np.take(x, [-1], axis) for axis in range(3)]
     return np.stack([f * np.diff(x, axis=axis, append=ends[axis]) for axis, f in enumerate(factors)])
 
 
 def _gradient_adjoint(slopes: Array, factors: Array) -> Array:
-    """The adjoint of `_gradient`."""
+    """Return the adjoint of `_gradient` applied to `slopes` (3, n_x, n_y, n_z), an array (n_x, n_y, n_z)."""
     inner = [np.delete(slopes[axis], -1, axis) for axis in range(3)]
     return -sum(f * np.diff(inner[axis], axis=axis, prepend=0, append=0) for axis, f in enumerate(factors))

@@ -1,6 +1,5 @@
-"""Back-projections of a run's images: the job of ``mphdrr backproject``."""
+"""Back-projections of a run's images, for ``mphdrr backproject`` and Blender's panel."""
 
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -11,11 +10,10 @@ from ..geometry.grid import Grid
 from ..models.model import with_image_axes
 from ..perspective.backprojection import HOW, backproject
 from ..progress import Stages
-from ..projector import Emission
 from ..validation import instance, one_of
 from ..volumes.volume import Volume
 from .recipe import Recipe
-from .reconstructing import line_integrals, recipe_of, reconstruction_grid
+from .reconstructing import line_integrals, reconstruction_grid, reconstruction_recipe
 from .run import ProjectionRun
 from .run_recipe import recipe_model
 
@@ -32,21 +30,25 @@ def backproject_run(
     Parameters
     ----------
     run : ProjectionRun
-        Simulated or measured, with a recipe.
+        Simulated or measured run with a recipe.
     how : str
-        "sum", "product" (the geometric mean) or "minimum", the argument of `backproject`.
+        "sum", "product" (the geometric mean) or "minimum", see `backproject`.
     recipe : Recipe
-        Its voxels, ``reconstruction.voxels``, ``spacing`` and ``center``, are those of the volume; by default the run's own.
+        Recipe with the volume's voxels: ``reconstruction.voxels``, ``spacing`` and ``center``; by default the run's own.
     grid : Grid
-        Instead of these.
+        Grid of the volume, in place of the recipe's.
     stages
-        Begins the stage: back-projecting.
+        Function that begins the stage "back-projecting".
 
     Returns
     -------
     Volume
-        Its quantity is "backprojection", in the unit of line integrals: of counts kBq/mL mm, of radiographs none. Products
-        and minima of images that reach beyond the crystals, where pixels count nothing, are refused.
+        Volume of the quantity "backprojection", in the unit of line integrals: kBq/mL mm from counts, none from radiographs.
+
+    Raises
+    ------
+    InputError
+        A product or minimum of images with pixels that detect nothing, such as pixels beside the crystals, is asked for.
     """
     one_of(how, HOW, "how")
     images = run_line_integrals(run)
@@ -61,29 +63,34 @@ def backproject_run(
 
 
 def backprojection_grid(run: ProjectionRun, recipe: Recipe | None = None) -> Grid:
-    """The voxels on which `backproject_run` is by default: those of a reconstruction."""
-    return reconstruction_grid(run, recipe_of(run, recipe))
+    """Return the default grid of `backproject_run`, that of a reconstruction of the run."""
+    return reconstruction_grid(run, reconstruction_recipe(run, recipe))
 
 
 def run_line_integrals(run: ProjectionRun) -> Floats32:
-    """The images of a run as line integrals along the pixels' rays, comparable from module to module.
+    """Return the images of a run as line integrals along the pixels' rays, comparable from module to module.
 
-    Counts, less the expected background, are divided by what each pixel counts of a line integral of 1 through the middle
-    of an ideal hole: time, photons per decay, the hole's effective area, the pixel's size and its angle, the crystal's
-    share. What does not belong to a single ray stays in them: the blur of hole and crystal, attenuation, and noise, so that
-    some may be below 0. Of the counts of an ideal pinhole without attenuation, and of radiographs, the line integrals are
-    exact.
+    Counts minus the expected background are divided by the pixel weight: the expected counts per unit line integral through
+    the centre of an ideal hole, from acquisition time, photons per decay, the hole's effective area, the pixel's size and
+    angle, and the crystal's absorption. Effects that no single ray has remain: the blur of hole and crystal, attenuation,
+    and noise, which may make line integrals negative. Line integrals of radiographs, and of counts through an ideal pinhole
+    without attenuation, are exact.
 
     Parameters
     ----------
     run : ProjectionRun
-        Simulated or measured, with a recipe.
+        Simulated or measured run with a recipe.
 
     Returns
     -------
     array (M, n_v, n_u) of float32
-        In kBq/mL mm of counts; of radiographs without unit, or the volume's times mm. 0 where a pixel counts nothing.
-        Images of the model "inverse-square" are no line integrals, and refused.
+        Line integrals, kBq/mL mm from counts; from radiographs without a unit, or in the volume's unit times mm. They are 0
+        at pixels that detect nothing.
+
+    Raises
+    ------
+    InputError
+        The model is "inverse-square", whose images are no line integrals.
     """
     instance(run, ProjectionRun, "run_line_integrals")
     recipe = run.recipe
@@ -102,20 +109,19 @@ def run_line_integrals(run: ProjectionRun) -> Floats32:
 
 
 def _pixel_weights(run: ProjectionRun) -> Floats:
-    """What pixels (M, n_v, n_u) count of a line integral of 1 along their rays through the middle of the hole."""
+    """Return the pixel weights (M, n_v, n_u): expected counts per unit line integral through the hole's centre."""
     model: Any = recipe_model(run.recipe, run.system, run=run)
-    assert isinstance(model, Emission)
-    middle = replace(model, hole="point", aperture_points=None, aperture_tolerance=None, pixel_points=1, depth_layers=1)
-    anywhere = Grid.centered((1, 1, 1), 1.0)  # weights do not depend on it
-    every = slice(None)
+    point_model = model.without_blur()
+    any_grid = Grid.centered((1, 1, 1), 1.0)  # the weights do not depend on the grid
+    every = slice(None)  # every layer, row and column
     return with_image_axes(model.efficiency) * np.array([
-        sum(beam.weights(every, every, every).sum(axis=0) for beam in middle.beams(run.views, m, anywhere))  # type: ignore[misc]
+        sum(beam.weights(every, every, every).sum(axis=0) for beam in point_model.beams(run.views, m, any_grid))  # type: ignore[misc]
         for m in range(len(run.views))
     ])  # fmt: skip
 
 
 def _require_all_count(run: ProjectionRun) -> None:
-    """Refuse images with pixels that count nothing: they would make products and minima 0."""
+    """Raise `InputError` for images with pixels that detect nothing, which would make products and minima 0."""
     if run.recipe["model.kind"] == "emission" and not _pixel_weights(run).all():
         raise InputError(
             "the images reach beyond the crystals or have dead pixels, which count nothing, and products and minima would "

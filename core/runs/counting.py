@@ -1,4 +1,4 @@
-"""What pixels and modules make of photons: efficiencies from files, and dead time, as recipes say them."""
+"""Detection efficiencies, from files too, and dead time of a recipe."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -17,11 +17,11 @@ from ..volumes.formats import numpy_files
 from .recipe import Recipe
 
 EFFICIENCY = "efficiency"
-"""The name of the array in .npz and .h5, where there are several."""
+"""Name of the array of efficiencies in .npz and .h5 files with several arrays."""
 
 
 def read_efficiency(path: AnyPath) -> Array:
-    """The efficiencies (M,) or (M, n_v, n_u) in a file: the array of .npy; of .npz and .h5 the only one, or "efficiency"."""
+    """Return the efficiencies (M,) or (M, n_v, n_u) of a file: its only array, or the one called "efficiency"."""
     with reading(require_file(path), "efficiencies"):
         if Path(path).suffix.lower() in (".npy", ".npz"):
             arrays = numpy_files.load(Path(path))
@@ -34,31 +34,31 @@ def read_efficiency(path: AnyPath) -> Array:
 
 
 def recipe_efficiency(recipe: Recipe) -> Any:
-    """A recipe's efficiency: a number, those of modules, or what its file holds."""
-    given = recipe["model.efficiency"]
-    return read_efficiency(given) if isinstance(given, str) else given
+    """Return a recipe's efficiency: one number, one for each module (M,), or the array of its file."""
+    efficiency = recipe["model.efficiency"]
+    return read_efficiency(efficiency) if isinstance(efficiency, str) else efficiency
 
 
-def dead_time_of(recipe: Recipe) -> tuple[float, str]:
-    """A recipe's dead time, s, and its kind."""
+def recipe_dead_time(recipe: Recipe) -> tuple[float, str]:
+    """Return a recipe's dead time, s, and its kind, "non-paralysable" or "paralysable"."""
     return 1e-6 * recipe["model.dead_time"], recipe["model.dead_time_kind"]
 
 
-def live_shares_of(recipe: Recipe, counts: Array, record: Mapping[str, Any] = MappingProxyType({})) -> Floats:
-    """The shares (M, 1, 1) of photons that modules with a recipe's dead time recorded, by their counts (M, n_v, n_u).
+def recorded_shares(recipe: Recipe, counts: Array, record: Mapping[str, Any] = MappingProxyType({})) -> Floats:
+    """Return the fractions (M, 1, 1) of photons that modules with a recipe's dead time recorded, from counts (M, n_v, n_u).
 
-    What a measured run's `record` says of scatter's energy windows has kept them busy, too.
+    The counts of a measured run's scatter windows, which `record` holds, kept the modules busy, too.
     """
-    seconds, kind = dead_time_of(recipe)
+    seconds, kind = recipe_dead_time(recipe)
     if not seconds:
         return np.ones((1, 1, 1))
     totals = counts.sum(axis=(1, 2), dtype=float) + record.get("scatter", {}).get("counts", 0.0)
     return live_shares(totals[:, None, None], recipe["model.time"], seconds, kind)  # type: ignore[arg-type]
 
 
-def scaled(values: float | Floats, shares: Array) -> float | Floats:
-    """Efficiencies or a background, of any of their forms, times shares (M, 1, 1) of modules."""
+def scale_by_module(values: float | Floats, shares: Array) -> float | Floats:
+    """Return efficiencies or a background, (), (M,) or (M, n_v, n_u), multiplied by the modules' `shares` (M, 1, 1)."""
     if np.all(shares == 1):
         return values
-    found = with_image_axes(values) * shares
-    return found if np.ndim(values) == 3 else found[:, 0, 0]
+    scaled = with_image_axes(values) * shares
+    return scaled if np.ndim(values) == 3 else scaled[:, 0, 0]

@@ -1,14 +1,14 @@
-"""Numbers as colours: the window, the scale and the colours that a picture of projections is shown in."""
+"""Numbers as colours: window, scale and colour map of a picture, and pictures in another size."""
 
 from dataclasses import dataclass
 
 import numpy as np
 
-from ..arrays import ArrayLike, Bytes, Floats32
+from ..arrays import ArrayLike, Bytes, Floats, Floats32
 from ..errors import InputError
 from ..validation import one_of
 
-# 17 evenly spaced colours of each map, between which is interpolated: matplotlib's, less than 2.5 % away (CC0).
+# Colours of each map at 17 even steps; interpolated, they are within 2.5 % of matplotlib's maps (CC0).
 _COLORS = {
     "inferno": "000004 0b0724 210c4a 3d0965 57106e 71196e 8a226a a32c61 bc3754 d04545 e35933 f1711f f98c0a fcaa0f f9c932 "
     "f2e865 fcffa4",
@@ -21,28 +21,31 @@ _COLORS = {
     "dark diverging": "c4e6ff 5aaef0 2a6fbb 173a63 0c0d10 632018 c8402f f0805c ffd9c4",
 }
 DIVERGING, DARK_DIVERGING = "diverging", "dark diverging"
-"""Names of the colours of differences: blue below the middle, white there, or nearly black on dark pages, red above it."""
+"""Colour maps of differences: blue below the middle and red above it; the middle is white, or nearly black on dark pages."""
 COLORS = tuple(name for name in _COLORS if name not in (DIVERGING, DARK_DIVERGING))
 """Names of the colour maps; all but grey are perceptually uniform."""
 SCALES = ("linear", "sqrt", "log")
 _DECADES = 3.0
-"""That an automatic logarithmic window spans."""
+"""Decades that an automatic logarithmic window spans."""
 
 
 @dataclass(frozen=True)
 class Display:
-    """How numbers are shown as colours.
+    """Display of numbers as colours.
 
-    `low` and `high` are the numbers that have the first and the last colour; None is automatic: 0, or the smallest number
-    where that is negative, and the largest. On the logarithmic scale an automatic `low` is a thousandth of `high`. `half`:
-    only the middle half of each image is shown, which users call the FOV; all of it is their wide FOV.
+    An automatic `low` is 0, or the smallest number if that is negative; on the logarithmic scale, a thousandth of `high`.
     """
 
     colors: str = "inferno"
+    """Colour map, a name of `COLORS`."""
     scale: str = "linear"
+    """Scale, a name of `SCALES`."""
     low: float | None = None
+    """Number with the first colour; None for an automatic one."""
     high: float | None = None
+    """Number with the last colour; None for the largest number."""
     half: bool = False
+    """Whether only the middle half of each image is shown, which users call the FOV; the whole image is the wide FOV."""
 
     def __post_init__(self) -> None:
         if self.colors not in _COLORS:
@@ -57,12 +60,12 @@ class Display:
             raise InputError(f"low = {self.low:g}: expected more than 0 on the logarithmic scale")
 
     def part(self, images: Floats32) -> Floats32:
-        """What of images (..., n_v, n_u) is shown."""
+        """Return the part of images (..., n_v, n_u) that is shown."""
         n_v, n_u = images.shape[-2:]
         return images[..., n_v // 4 : n_v - n_v // 4, n_u // 4 : n_u - n_u // 4] if self.half else images
 
     def window(self, values: ArrayLike) -> tuple[float, float]:
-        """The numbers that get the first and the last colour where `values` are shown."""
+        """Return the numbers with the first and the last colour if `values` are shown."""
         values = np.asarray(values)
         low, high = self.low, self.high
         if high is None:
@@ -75,11 +78,13 @@ class Display:
         return low, high
 
     def shares(self, values: ArrayLike, window: tuple[float, float]) -> Floats32:
-        """Where `values` stand between the first colour, 0, and the last, 1; numbers outside the window are clipped."""
+        """Return the places of `values` between the first colour, 0, and the last, 1; clipped to the window."""
         low, high = window
         numbers = np.asarray(values, np.float32)
         if self.scale == "log":
-            low, high = (float(np.float32(end)) for end in window)  # as the numbers: the smallest ones have few digits
+            low, high = (
+                float(np.float32(end)) for end in window
+            )  # float32, as the numbers: small ones have few digits
             if not 0 < low < high:
                 return (numbers >= high).astype(np.float32) if high > 0 else np.zeros_like(numbers)
             numbers = np.log(np.maximum(numbers, low, dtype=np.float32))
@@ -88,20 +93,20 @@ class Display:
         return np.nan_to_num(np.sqrt(shares) if self.scale == "sqrt" else shares, nan=0.0)
 
     def value_at(self, share: float, window: tuple[float, float]) -> float:
-        """The number that `shares` puts at `share`."""
+        """Return the number whose place in the window, as `shares` computes it, is `share`."""
         low, high = window
         if self.scale == "log":
             return float(low * (high / low) ** share) if 0 < low < high else high * share
         return low + (high - low) * (share**2 if self.scale == "sqrt" else share)
 
     def colored(self, values: ArrayLike, window: tuple[float, float] | None = None) -> Bytes:
-        """Colours (..., 3), 8-bit sRGB, of `values` (...), in the window given or in their own."""
+        """Return colours (..., 3), 8-bit sRGB, of `values` (...), in the given window or in their automatic one."""
         shares = self.shares(values, self.window(values) if window is None else window)
         return _table(self.colors)[np.rint(shares * 255).astype(np.uint8)]
 
 
 def _table(colors: str) -> Bytes:
-    """256 colours (256, 3)."""
+    """Return the 256 colours (256, 3), 8-bit sRGB, of a map."""
     anchors = np.array([list(bytes.fromhex(text)) for text in _COLORS[colors].split()], float)
     places = np.linspace(0, len(anchors) - 1, 256)
     channels = [np.interp(places, np.arange(len(anchors)), channel) for channel in anchors.T]
@@ -109,5 +114,21 @@ def _table(colors: str) -> Bytes:
 
 
 def unit_text(unit: str) -> str:
-    """A unit as people write it: line integrals of mu are numbers."""
+    """Return a unit as people write it; line integrals of mu, 1/mm mm, have none."""
     return unit.replace("1/mm mm", "").replace(" mm", " · mm")
+
+
+def resize_picture(picture: ArrayLike, rows: int, columns: int) -> Floats32:
+    """Return a picture (h, w, channels) as (rows, columns, channels): each new pixel is the mean of the area it covers."""
+    tall = _resize_rows(np.asarray(picture, np.float64), rows)
+    return _resize_rows(tall.swapaxes(0, 1), columns).swapaxes(0, 1).astype(np.float32)
+
+
+def _resize_rows(picture: Floats, rows: int) -> Floats:
+    """Return a picture (h, ...) as (rows, ...), by differences of its cumulative sum, interpolated at the new edges."""
+    height = len(picture)
+    sums = np.concatenate([np.zeros_like(picture[:1]), picture.cumsum(axis=0)])
+    edges = np.linspace(0.0, height, rows + 1)
+    below = np.minimum(edges.astype(int), height - 1)
+    at_edges = sums[below] + (edges - below)[:, None, None] * picture[below]
+    return np.diff(at_edges, axis=0) * (rows / height)

@@ -6,14 +6,14 @@ import zlib
 import numpy as np
 from numpy.typing import ArrayLike
 
-_LINES = 16  # in a block that is compressed
-_ZIP = 3
+_LINES = 16  # rows of a compressed block
+_ZIP = 3  # code of the compression
 
 
 def exr_bytes(picture: ArrayLike) -> bytes:
-    """The contents of an .exr file of a picture (height, width), float32, row 0 at the top, compressed without loss.
+    """Return the bytes of an .exr file of a picture (height, width), float32, row 0 at the top, compressed without loss.
 
-    Its channel is luminance: programs that show colours put the number into red, green and blue.
+    The channel is luminance: programs that show colours put the number into red, green and blue.
     """
     pixels = np.ascontiguousarray(picture, "<f4")
     height, width = pixels.shape
@@ -23,7 +23,7 @@ def exr_bytes(picture: ArrayLike) -> bytes:
         (b"compression", b"compression", bytes([_ZIP])),
         (b"dataWindow", b"box2i", window),
         (b"displayWindow", b"box2i", window),
-        (b"lineOrder", b"lineOrder", b"\0"),  # from the top
+        (b"lineOrder", b"lineOrder", b"\0"),  # rows from the top
         (b"pixelAspectRatio", b"float", struct.pack("<f", 1.0)),
         (b"screenWindowCenter", b"v2f", struct.pack("<2f", 0.0, 0.0)),
         (b"screenWindowWidth", b"float", struct.pack("<f", 1.0)),
@@ -34,15 +34,15 @@ def exr_bytes(picture: ArrayLike) -> bytes:
     for line in range(0, height, _LINES):
         data = _packed(pixels[line : line + _LINES].tobytes())
         blocks.append(struct.pack("<2i", line, len(data)) + data)
-    first = len(header) + 8 * len(blocks)
-    starts = first + np.cumsum([0, *map(len, blocks[:-1])])
+    first_block = len(header) + 8 * len(blocks)
+    starts = first_block + np.cumsum([0, *map(len, blocks[:-1])])
     return b"".join([header, starts.astype("<u8").tobytes(), *blocks])
 
 
 def _packed(data: bytes) -> bytes:
-    """A block as the format's ZIP stores it: differences of its even, then its odd bytes; unchanged if that is shorter."""
+    """Return a block compressed by the format's ZIP: differences of the even, then the odd bytes; unchanged if shorter."""
     octets = np.frombuffer(data, np.uint8)
-    sorted_ = np.concatenate([octets[0::2], octets[1::2]])
-    sorted_[1:] = np.diff(sorted_) + np.uint8(128)
-    packed = zlib.compress(sorted_.tobytes(), 1)
+    reordered = np.concatenate([octets[0::2], octets[1::2]])
+    reordered[1:] = np.diff(reordered) + np.uint8(128)
+    packed = zlib.compress(reordered.tobytes(), 1)
     return packed if len(packed) < len(data) else data

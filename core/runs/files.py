@@ -1,6 +1,6 @@
-"""Run files: HDF5, numpy archives and torch files, each of which holds a run whole.
+"""Run files: HDF5, NumPy archives and torch files, each of which holds a whole run.
 
-Whatever the format, a file holds arrays by name (``"geometry/center"``) with units, and attributes (text or whole numbers).
+In every format, a file holds arrays by name (``"geometry/center"``) with units, and attributes (texts or whole numbers).
 """
 
 import hashlib
@@ -17,18 +17,17 @@ from ..errors import InputError, needing, reading
 from ..files import AnyPath, require_ending, require_file, write_bytes
 from ..geometry.grid import Grid
 from ..geometry.scanner import Scanner
-from ..geometry.system import PinholeSystem
 from ..geometry.views import Views
 from ..hdf5 import attributes, datasets, opened, pack, read_numbers
 from ..scanner_kinds import scanner_kind
 from ..volumes.formats import numpy_files
 from ..volumes.volume import Volume
-from .formats import FORMATS
+from . import FORMATS
 from .run import ProjectionRun
 
 _FORMAT = "mphDRR run"
 _FORMAT_VERSION = 2
-"""Of files of measured runs, which hold no volume; others stay what earlier versions of mphDRR read, version 1."""
+"""Version of files of measured runs, which hold no volume; files with one are of version 1, which earlier mphDRR read."""
 
 _CONVENTIONS = (
     "Lengths in mm. World: right-handed, origin at the isocentre, +z along the patient. "
@@ -42,113 +41,114 @@ _CONVENTIONS = (
 _RAYS = ("sources", "detector_centers", "u_steps", "v_steps")
 
 _FILE_NAMES = {"centers": "center"}
-"""Attribute of a scanner -> its name in files, where that is another."""
+"""Names in files of those attributes of a scanner whose names differ there."""
 _UNITS = {"length": "mm", "angle": "rad"}
 _PINHOLE = "pinhole"
-"""The kind of scanner of files that name none."""
+"""Kind of scanner of files that name no kind."""
 _KIND, _TEXTS = "scanner", "texts"
-"""Attributes: the kind of scanner where it is another, and the texts of its columns, as JSON."""
+"""Names of the attributes for a kind of scanner other than pinhole, and for the columns of text, as JSON."""
 
 
-def _geometry(scanner: Scanner) -> dict[str, tuple[str, Array]]:
-    """Unit and contents of the arrays of a scanner, by name."""
-    found = {"number": ("", scanner.numbers), "ring": ("", scanner.rings()), "pose": ("mm", scanner.poses())}
-    if isinstance(scanner, PinholeSystem):
-        found["pinhole_distance"] = ("mm", scanner.pinhole_distance)
+def _geometry_arrays(scanner: Scanner) -> dict[str, tuple[str, Array]]:
+    """Return unit and values of a scanner's arrays by name."""
+    arrays = {"number": ("", scanner.numbers), "ring": ("", scanner.rings()), "pose": ("mm", scanner.poses())}
+    arrays |= {name: ("mm", lengths) for name, lengths in scanner.derived_lengths().items()}
     for name, values in scanner.filled().items():
         column = scanner.columns.fields[name][0]
         if not column.is_text:
-            found[_FILE_NAMES.get(name, name)] = (_UNITS.get(column.kind, ""), values)
-    return {f"geometry/{name}": item for name, item in found.items()}
+            arrays[_FILE_NAMES.get(name, name)] = (_UNITS.get(column.kind, ""), values)
+    return {f"geometry/{name}": item for name, item in arrays.items()}
 
 
-def _texts(scanner: Scanner) -> dict[str, list[str]]:
-    """Attribute -> the texts of a column."""
+def _column_texts(scanner: Scanner) -> dict[str, list[str]]:
+    """Return the columns of text of a scanner by attribute."""
     filled = scanner.filled().items()
     return {name: values.tolist() for name, values in filled if scanner.columns.fields[name][0].is_text}
 
 
-def _scanner(arrays: dict[str, Array], attributes: dict[str, Any]) -> Scanner:
-    """The scanner that a file holds."""
+def _read_scanner(arrays: dict[str, Array], attributes: dict[str, Any]) -> Scanner:
+    """Return the scanner of a file; raise `InputError` if an array is missing."""
     kind = scanner_kind(attributes.get(_KIND, _PINHOLE))
-    given = {"numbers": arrays["geometry/number"], **json.loads(attributes.get(_TEXTS, "{}"))}
+    values = {"numbers": arrays["geometry/number"], **json.loads(attributes.get(_TEXTS, "{}"))}
     for name, (column, *_) in kind.columns.fields.items():
         place = f"geometry/{_FILE_NAMES.get(name, name)}"
         if place in arrays:
-            given[name] = arrays[place]
-        elif name not in given and not column.has_constant_blank:
+            values[name] = arrays[place]
+        elif name not in values and not column.has_constant_blank:
             raise InputError(f"array {place} is missing")
-    return kind.of(given)
+    return kind.of(values)
 
 
 _VOLUME = ("volume/array", "volume/affine")
-"""Which a measured run does not have."""
-_BACKGROUND = "background"  # in the unit of the projections; where there is none, nothing but the volume was projected
-_EFFICIENCY = "efficiency"  # where there is none, 1
+"""Names of the volume's arrays, which a file of a measured run does not have."""
+_BACKGROUND = "background"  # in the unit of the projections; 0 if the array is missing
+_EFFICIENCY = "efficiency"  # 1 if the array is missing
 _ATTRIBUTES, _SHA256 = "attributes", "sha256"
-_COMPRESS_FROM = 1 << 16  # bytes: below, compressing costs more than it saves
+_COMPRESS_FROM = 1 << 16  # bytes; smaller arrays are not worth compressing
 
 _Arrays = dict[str, tuple[str, Array]]
-"""Unit and contents of arrays by name."""
+"""Units and values of arrays by name."""
 _Contents = tuple[dict[str, Array], dict[str, Any]]
 """Arrays and attributes by name."""
 
 
 def write_run(run: ProjectionRun, path: AnyPath) -> None:
-    """Write a run as HDF5 (.h5, .hdf5), numpy archive (.npz) or torch file (.pt), by the path's suffix.
+    """Write a run as HDF5 (.h5, .hdf5), NumPy archive (.npz) or torch file (.pt), by the path's ending.
 
-    `InputError` for another suffix, where torch is missing for .pt, or the file cannot be written: the old one then stays.
+    Raises `InputError` for another ending, if torch is missing for .pt, or if the file cannot be written; an existing file
+    then stays as it is.
     """
-    packed, _ = _FORMATS[require_ending(path, FORMATS)]
-    of_volume, of_scanner = {}, {}
+    pack_file, _ = _FORMATS[require_ending(path, FORMATS)]
+    volume_attributes, scanner_attributes = {}, {}
     if run.volume is not None:
-        of_volume = {"volume_quantity": run.volume.quantity, "volume_unit": run.volume.unit}
+        volume_attributes = {"volume_quantity": run.volume.quantity, "volume_unit": run.volume.unit}
     if run.system.kind != _PINHOLE:
-        of_scanner[_KIND] = run.system.kind
-    if texts := _texts(run.system):
-        of_scanner[_TEXTS] = json.dumps(texts)
+        scanner_attributes[_KIND] = run.system.kind
+    if texts := _column_texts(run.system):
+        scanner_attributes[_TEXTS] = json.dumps(texts)
     attributes = {
-        "format": _FORMAT, "format_version": 1 if of_volume else _FORMAT_VERSION, "conventions": _CONVENTIONS,
-        "projections_unit": run.unit, **of_volume, "seed": "none" if run.seed is None else int(run.seed),
-        "workbook": run.workbook, "workbook_sha256": run.workbook_sha256, **of_scanner,
+        "format": _FORMAT, "format_version": 1 if volume_attributes else _FORMAT_VERSION, "conventions": _CONVENTIONS,
+        "projections_unit": run.unit, **volume_attributes, "seed": "none" if run.seed is None else int(run.seed),
+        "workbook": run.workbook, "workbook_sha256": run.workbook_sha256, **scanner_attributes,
         "settings": json.dumps(dict(run.settings)), "versions": json.dumps(dict(run.versions)),
     }  # fmt: skip
-    write_bytes(path, packed(_arrays(run), attributes))
+    write_bytes(path, pack_file(_run_arrays(run), attributes))
 
 
-def _arrays(run: ProjectionRun) -> _Arrays:
-    """Name, unit and contents of all arrays of a run's file."""
+def _run_arrays(run: ProjectionRun) -> _Arrays:
+    """Return units and values of all arrays of a run's file by name."""
     views = run.views
-    found = {"projections": (run.unit, run.projections), **_geometry(run.system)}
-    found["geometry/intrinsics"] = ("pixel", run.intrinsics())
-    found["geometry/projection_matrix"] = ("pixel", views.projection_matrices())
-    found |= {f"views/{name}": ("mm", getattr(views, name)) for name in _RAYS}
+    arrays = {"projections": (run.unit, run.projections), **_geometry_arrays(run.system)}
+    arrays["geometry/intrinsics"] = ("pixel", run.intrinsics())
+    arrays["geometry/projection_matrix"] = ("pixel", views.projection_matrices())
+    arrays |= {f"views/{name}": ("mm", getattr(views, name)) for name in _RAYS}
     if run.volume is not None:
-        found |= {_VOLUME[0]: (run.volume.unit, run.volume.array), _VOLUME[1]: ("mm", run.volume.grid.affine)}
+        arrays |= {_VOLUME[0]: (run.volume.unit, run.volume.array), _VOLUME[1]: ("mm", run.volume.grid.affine)}
     if np.any(run.background):
-        found[_BACKGROUND] = (run.unit, np.asarray(run.background))
+        arrays[_BACKGROUND] = (run.unit, np.asarray(run.background))
     if np.any(np.asarray(run.efficiency) != 1):
-        found[_EFFICIENCY] = ("", np.asarray(run.efficiency))
-    return found
+        arrays[_EFFICIENCY] = ("", np.asarray(run.efficiency))
+    return arrays
 
 
 def read_run(path: AnyPath) -> ProjectionRun:
-    """Read a run written by `write_run`; `InputError` where there is no such file, or no whole run in it."""
+    """Read a run written by `write_run`; raise `InputError` if there is no such file, or if it holds no complete run."""
     _, read = _FORMATS[require_ending(path, FORMATS)]
     with reading(require_file(path), "a projection run"):
-        return _run_of(*read(Path(path)))
+        return _build_run(*read(Path(path)))
 
 
-def _run_of(arrays: dict[str, Array], attributes: dict[str, Any]) -> ProjectionRun:
+def _build_run(arrays: dict[str, Array], attributes: dict[str, Any]) -> ProjectionRun:
+    """Return the run of a file's arrays and attributes; raise `InputError` if they are incomplete or were changed."""
     if attributes.get("format") != _FORMAT:
         raise InputError(f"expected a file marked {_FORMAT!r}, found {attributes.get('format', 'no mark')!r}")
     if int(attributes["format_version"]) > _FORMAT_VERSION:
         raise InputError(f"written by a newer mphDRR (format {attributes['format_version']}); update to read it")
     sha256 = attributes.pop(_SHA256, None)
-    if sha256 not in (None, _sha256(arrays, attributes)):
+    if sha256 not in (None, _content_hash(arrays, attributes)):
         raise InputError("changed: its arrays or attributes are not those that were written")
     is_measured = int(attributes["format_version"]) == _FORMAT_VERSION
-    system = _scanner(arrays, attributes)
+    system = _read_scanner(arrays, attributes)
     for name in ("projections", *(() if is_measured else _VOLUME), *(f"views/{name}" for name in _RAYS)):
         if name not in arrays:
             raise InputError(f"array {name} is missing")
@@ -170,13 +170,13 @@ def _run_of(arrays: dict[str, Array], attributes: dict[str, Any]) -> ProjectionR
         workbook=str(attributes["workbook"]),
         workbook_sha256=str(attributes["workbook_sha256"]),
         versions=json.loads(attributes["versions"]),
-        background=arrays.get(_BACKGROUND, 0.0),  # type: ignore[arg-type]  # checked there
+        background=arrays.get(_BACKGROUND, 0.0),  # type: ignore[arg-type]  # checked by `ProjectionRun`
         efficiency=arrays.get(_EFFICIENCY, 1.0),  # type: ignore[arg-type]
     )
 
 
-def _sha256(arrays: dict[str, Array], attributes: dict[str, Any]) -> str:
-    """Of all that a run's file holds."""
+def _content_hash(arrays: dict[str, Array], attributes: dict[str, Any]) -> str:
+    """Return the SHA-256 of all arrays and attributes of a run's file."""
     digest = hashlib.sha256(json.dumps(attributes, sort_keys=True).encode())
     for name, array in sorted(arrays.items()):
         digest.update(f"{name} {array.dtype.str} {array.shape}".encode())
@@ -184,59 +184,63 @@ def _sha256(arrays: dict[str, Array], attributes: dict[str, Any]) -> str:
     return digest.hexdigest()
 
 
-def _packed_hdf5(arrays: _Arrays, attributes: dict[str, Any]) -> memoryview:
-    """Arrays as datasets with a `unit`, in chunks of one view each, so that one view reads alone; attributes on the root."""
+def _pack_hdf5(arrays: _Arrays, attributes: dict[str, Any]) -> memoryview:
+    """Return an HDF5 file: datasets with a `unit`, with chunks of one view for reading views singly, and attributes."""
 
     def fill(file: Any) -> None:
         file.attrs.update(attributes)
         for name, (unit, array) in arrays.items():
-            packed: dict[str, Any] = {}
+            compression: dict[str, Any] = {}
             if array.nbytes >= _COMPRESS_FROM:
-                packed = {"compression": "gzip", "compression_opts": 1, "shuffle": True}
-                packed["chunks"] = (1, *array.shape[1:])
-            file.create_dataset(name, data=array, **packed).attrs["unit"] = unit
+                compression = {"compression": "gzip", "compression_opts": 1, "shuffle": True}
+                compression["chunks"] = (1, *array.shape[1:])
+            file.create_dataset(name, data=array, **compression).attrs["unit"] = unit
 
     return pack(_FORMAT, {}, fill)
 
 
 def _read_hdf5(path: Path) -> _Contents:
+    """Return arrays and attributes of an HDF5 file."""
     with opened(path, whole=True) as file:
         return {name: read_numbers(item) for name, item in datasets(file).items()}, attributes(file)
 
 
-def _packed_npz(described: _Arrays, attributes: dict[str, Any]) -> memoryview:
-    """Arrays by name, attributes as JSON text."""
+def _pack_npz(described: _Arrays, attributes: dict[str, Any]) -> memoryview:
+    """Return a NumPy archive: arrays by name, and the attributes as JSON text."""
     arrays = {name: array for name, (_, array) in described.items()}
-    text = json.dumps({**attributes, _SHA256: _sha256(arrays, attributes)})
+    text = json.dumps({**attributes, _SHA256: _content_hash(arrays, attributes)})
     return numpy_files.pack_npz({**arrays, _ATTRIBUTES: np.array(text)})
 
 
 def _read_npz(path: Path) -> _Contents:
+    """Return arrays and attributes of a NumPy archive."""
     arrays = numpy_files.load(path)
     return arrays, json.loads(str(arrays.pop(_ATTRIBUTES, "{}")))
 
 
-def _packed_pt(described: _Arrays, attributes: dict[str, Any]) -> memoryview:
-    """Only tensors, text and whole numbers: ``torch.load(path, weights_only=True)`` reads them."""
-    torch, memory = _torch(), io.BytesIO()
+def _pack_pt(described: _Arrays, attributes: dict[str, Any]) -> memoryview:
+    """Return a torch file of tensors, texts and whole numbers only, which ``torch.load(path, weights_only=True)`` reads."""
+    torch, memory = _import_torch(), io.BytesIO()
     arrays = {name: array for name, (_, array) in described.items()}
     tensors = {name: torch.from_numpy(np.array(array, order="C")) for name, array in arrays.items()}
-    torch.save({_ATTRIBUTES: {**attributes, _SHA256: _sha256(arrays, attributes)}, **tensors}, memory)
+    torch.save({_ATTRIBUTES: {**attributes, _SHA256: _content_hash(arrays, attributes)}, **tensors}, memory)
     return memory.getbuffer()
 
 
 def _read_pt(path: Path) -> _Contents:
-    content = _torch().load(path, weights_only=True, map_location="cpu")
+    """Return arrays and attributes of a torch file."""
+    content = _import_torch().load(path, weights_only=True, map_location="cpu")
     attributes = content.pop(_ATTRIBUTES, {})
     return {name: tensor.numpy() for name, tensor in content.items()}, attributes
 
 
-def _torch() -> Any:
+def _import_torch() -> Any:
+    """Return the module torch; raise `InputError` if it is missing."""
     with needing(feature=".pt files, unlike .h5 and .npz"):
         import torch
     return torch
 
 
 _Format = tuple[Callable[[_Arrays, dict[str, Any]], memoryview], Callable[[Path], _Contents]]
-_HDF5: _Format = (_packed_hdf5, _read_hdf5)
-_FORMATS = dict(zip(FORMATS, (_HDF5, _HDF5, (_packed_npz, _read_npz), (_packed_pt, _read_pt)), strict=True))
+_HDF5: _Format = (_pack_hdf5, _read_hdf5)
+_FORMATS = dict(zip(FORMATS, (_HDF5, _HDF5, (_pack_npz, _read_npz), (_pack_pt, _read_pt)), strict=True))

@@ -1,4 +1,4 @@
-"""What frames of measured counts hardly are, by their numbers: warnings that name frame and pixel."""
+"""Checks of frames of measured counts: warnings of improbable numbers, which name frame and pixel."""
 
 import numpy as np
 
@@ -6,61 +6,73 @@ from ..arrays import Array, ArrayLike
 from ..errors import warn
 
 _FEW = 10
-"""Counts of a frame, and pixels: with more, chance leaves hardly a frame empty, or two frames equal."""
+"""Expected counts of a frame, and pixels with counts, above which chance makes no frame empty and no two frames equal."""
 _BRIGHT = 100
-"""Times as many counts as its neighbours has no pixel by hole and crystal, whose blur reaches them."""
+"""Ratio of a pixel's counts to its neighbours' that the blur of hole and crystal does not allow."""
 _WELL = 25
-"""Counts in most pixels around one: chance leaves it empty once in 7e10."""
-_AROUND = 5  # pixels, the side of what is around one
+"""Median counts around a pixel, with which a live pixel is empty by chance once in 7e10."""
+_SIDE = 5  # side of the neighbourhood of a pixel, in pixels
 
 
 def warn_of_frames(
-    array: Array, used: list[int], called: list[str], name: str, times: ArrayLike, declared: Array
+    array: Array, used: list[int], labels: list[str], name: str, times: ArrayLike, declared_dead: Array
 ) -> None:
-    """Warn of frames that hardly are what modules have counted: empty ones, equal ones, empty and bright pixels.
+    """Warn of frames that modules have hardly measured: empty frames, equal frames, empty pixels and bright pixels.
 
-    Those `used` took `times`, s: rates are compared. Pixels that are `declared` dead are not looked at.
+    Parameters
+    ----------
+    array
+        Counts (frames, rows, columns).
+    used, labels
+        Indices of the frames to check, and the names of all frames in messages.
+    name
+        Name of the files, with which messages begin.
+    times
+        Exposures of the frames `used`, s, one number or one for each; rates are compared.
+    declared_dead
+        Mask (frames, rows, columns) of pixels that are known to be dead and are not checked.
     """
     seconds = dict(zip(used, np.broadcast_to(times, len(used)).tolist(), strict=True))
-    counts = {k: np.where(declared[k], 0, array[k]) if declared[k].any() else array[k] for k in used}
+    counts = {k: np.where(declared_dead[k], 0, array[k]) if declared_dead[k].any() else array[k] for k in used}
     rates = {k: float(counts[k].sum(dtype=float)) / seconds[k] for k in used}
-    usual = float(np.median([rate for rate in rates.values() if rate] or [0.0]))
-    empty = [k for k in used if not rates[k] and usual * seconds[k] > _FEW and not declared[k].all()]
+    usual_rate = float(np.median([rate for rate in rates.values() if rate] or [0.0]))
+    empty = [k for k in used if not rates[k] and usual_rate * seconds[k] > _FEW and not declared_dead[k].all()]
     if empty:
-        others = usual * float(np.median(list(seconds.values())))
-        warn(f"{name}: no counts in {_some([called[k] for k in empty])}, {others:g} in others")
-    known: dict[bytes, int] = {}
-    pairs = [(known.setdefault(counts[k].tobytes(), k), k) for k in used if np.count_nonzero(counts[k]) > _FEW]
-    if equal := [f"{called[one]} and {called[k]}" for one, k in pairs if one != k]:
+        typical = usual_rate * float(np.median(list(seconds.values())))
+        warn(f"{name}: no counts in {_some([labels[k] for k in empty])}, {typical:g} in others")
+    first_frames: dict[bytes, int] = {}
+    pairs = [(first_frames.setdefault(counts[k].tobytes(), k), k) for k in used if np.count_nonzero(counts[k]) > _FEW]
+    if equal := [f"{labels[first]} and {labels[k]}" for first, k in pairs if first != k]:
         warn(f"{name}: equal in every pixel: {_some(equal)}")
-    dead = [(k, *place) for k in sorted(used) for place in _empty_pixels(counts[k], declared[k])]
+    dead = [(k, *place) for k in sorted(used) for place in _empty_pixels(counts[k], declared_dead[k])]
     if dead:
-        places = _some([f"{called[k]}, row {row + 1}, column {column + 1}" for k, row, column in dead])
-        warn(f"{name}: no counts in {places}, {_WELL} and more around; if they are dead, say so (--efficiency)")
-    usual = sorted([0.0, *(float(counts[k].max()) / seconds[k] for k in used)])[len(used) // 2]
+        listed = _some([f"{labels[k]}, row {row + 1}, column {column + 1}" for k, row, column in dead])
+        warn(f"{name}: no counts in {listed}, {_WELL} and more around; if they are dead, say so (--efficiency)")
+    usual_peak_rate = sorted([0.0, *(float(counts[k].max()) / seconds[k] for k in used)])[len(used) // 2]
     for k in used:
         row, column = divmod(int(counts[k].argmax()), array.shape[2])
-        near = counts[k][max(row - 1, 0) : row + 2, max(column - 1, 0) : column + 2]
-        *others_near, peak = np.sort(near, axis=None).tolist()
-        if peak > _BRIGHT * max(1, usual * seconds[k], *others_near):
-            text = f"{called[k]}, row {row + 1}, column {column + 1}: {peak:g} counts"
-            around = f"at most {max(others_near, default=0):g} in the pixels around it"
-            warn(f"{name}: {text}, {around} and {usual * seconds[k]:g} in others")
+        neighborhood = counts[k][max(row - 1, 0) : row + 2, max(column - 1, 0) : column + 2]
+        *neighbors, peak = np.sort(neighborhood, axis=None).tolist()
+        if peak > _BRIGHT * max(1, usual_peak_rate * seconds[k], *neighbors):
+            text = f"{labels[k]}, row {row + 1}, column {column + 1}: {peak:g} counts"
+            comparison = f"at most {max(neighbors, default=0):g} in the pixels around it"
+            warn(f"{name}: {text}, {comparison} and {usual_peak_rate * seconds[k]:g} in others")
 
 
-def _empty_pixels(counts: Array, declared: Array) -> list[tuple[int, int]]:
-    """Row and column of pixels without counts, around which most pixels have many."""
-    side = _AROUND // 2
-    known = np.pad(np.where(declared, np.nan, counts), side, constant_values=np.nan)
-    places = np.argwhere((counts == 0) & ~declared)
-    around = np.lib.stride_tricks.sliding_window_view(known, (_AROUND, _AROUND))[tuple(places.T)]
-    around = around.reshape(len(places), _AROUND**2)
-    likely = np.nansum(around, axis=1) >= _WELL * (1 + side) ** 2 / 2
-    places, around = places[likely], around[likely]
+def _empty_pixels(counts: Array, declared_dead: Array) -> list[tuple[int, int]]:
+    """Return row and column of pixels without counts in a frame, around which most pixels have `_WELL` counts or more."""
+    half = _SIDE // 2
+    padded = np.pad(np.where(declared_dead, np.nan, counts), half, constant_values=np.nan)
+    places = np.argwhere((counts == 0) & ~declared_dead)
+    neighborhoods = np.lib.stride_tricks.sliding_window_view(padded, (_SIDE, _SIDE))[tuple(places.T)]
+    neighborhoods = neighborhoods.reshape(len(places), _SIDE**2)
+    is_likely = np.nansum(neighborhoods, axis=1) >= _WELL * (1 + half) ** 2 / 2
+    places, neighborhoods = places[is_likely], neighborhoods[is_likely]
     if not len(places):
         return []
-    return [(int(row), int(column)) for row, column in places[np.nanmedian(around, axis=1) >= _WELL]]
+    return [(int(row), int(column)) for row, column in places[np.nanmedian(neighborhoods, axis=1) >= _WELL]]
 
 
 def _some(texts: list[str]) -> str:
+    """Return the first three texts, and the number of the others."""
     return "; ".join([*texts[:3], *([f"and {len(texts) - 3} more"] if len(texts) > 3 else [])])

@@ -1,6 +1,7 @@
-"""Files with frames of counts, as scanners and simulators write them: numpy, HDF5, raw, DICOM, MetaImage, Interfile.
+"""Files with frames of counts, as scanners and simulators write them: NumPy, HDF5, raw, DICOM, MetaImage, Interfile.
 
-A file says at most what its frames are: which module each is of, and how it lies on the crystal, stands in none of them.
+A file may hold exposures, pixel sizes and energy windows of its frames; none holds the module of a frame, or how the frame
+lies on the crystal. To add a format, write its reader and add its endings to `_READERS`.
 """
 
 import math
@@ -26,30 +27,23 @@ from ..volumes.formats.dicom import TOMOGRAMS, decode_pixels, image_kind, is_dic
 
 RAW_TYPES = ("uint8", "int8", "uint16", "int16", "uint32", "int32", "uint64", "int64", "float32", "float64")
 """Types of the numbers in raw files."""
-_NUMPY = (".npy", ".npz")
-_HDF5 = (".h5", ".hdf5")
-_META = (".mhd", ".mha")
-_INTERFILE = (".hdr", ".h33", ".hs")
-COUNTS_FORMATS = (*_NUMPY, *_HDF5, ".dcm", *_META, *_INTERFILE, ".raw", ".bin", ".dat")
-"""Endings of files with counts; DICOM files may have any name, and so may raw ones."""
-_SAME_SIZE = 1e-3  # relative; files round pixel sizes
+_SAME_SIZE = 1e-3  # relative tolerance of pixel sizes and times, which files round
 
 
 class Counts(np.ndarray[Any, Any]):
-    """Frames of counts (frames, rows, columns), with what their files say of them: an array like any other.
+    """Array of frames of counts (frames, rows, columns) with the facts that their files state.
 
-    Slices of it keep that; what is calculated from it is a plain array.
+    Slices keep these facts; arrays computed from it are plain.
 
     Attributes
     ----------
     about : array (frames, 7)
-        Of each frame its exposure, s, the size of its pixels along a row and down the columns, mm, the number of its energy
-        window, its start, s after that of the first frame of all, and the lowest and highest energy of its window, keV; NaN
-        where the file does not say it.
+        Exposure, s; pixel size along a row and down the columns, mm; number of the energy window; start, s after that of
+        the first frame; lowest and highest energy of the window, keV. NaN for a fact that the file does not state.
     kind : str
-        What the frames are of, such as "2 energy windows".
+        Composition of the frames, such as "2 energy windows".
     name : str
-        Of the files.
+        Names of the files.
     """
 
     about: Floats
@@ -60,32 +54,36 @@ class Counts(np.ndarray[Any, Any]):
         self.about = source.about if is_same else np.full((*self.shape[:1], 7), math.nan)
 
     def __getitem__(self, key: Any) -> Any:
-        found = super().__getitem__(key)
-        if isinstance(found, Counts) and found.ndim == 3:
+        part = super().__getitem__(key)
+        if isinstance(part, Counts) and part.ndim == 3:
             about = self.about[key[0] if isinstance(key, tuple) and key else key]
-            found.about = about if about.shape == found.about.shape else found.about
-        return found
+            part.about = about if about.shape == part.about.shape else part.about
+        return part
 
     def __array_wrap__(self, array: Array, *_: Any) -> Any:  # type: ignore[override]
         return np.asarray(array)[()]
 
-    def exposures(self, which: Any = slice(None)) -> list[float]:
-        """The exposures, s, that the files say of the frames `which`, each once."""
-        return [time for time in np.unique(self.about[which, 0]).tolist() if math.isfinite(time)]
+    def exposures(self, frames: Any = slice(None)) -> list[float]:
+        """Return the different exposures, s, that the files state for these frames; `frames` is an index."""
+        return [time for time in np.unique(self.about[frames, 0]).tolist() if math.isfinite(time)]
 
 
 @dataclass(frozen=True)
-class Layout:
-    """What the user says about a file."""
+class CountsLayout:
+    """Description of a file's contents by the user, with the arguments of `read_counts`."""
 
     dataset: str | None = None
+    """Name of the array in a file with several arrays."""
     shape: tuple[int, int, int] | None = None
+    """Frames, rows and columns of a raw file."""
     type: str | None = None
+    """Type of the numbers in a raw file, one of `RAW_TYPES`."""
     big_endian: bool = False
+    """Whether the most significant byte of a raw file's numbers comes first."""
 
     @property
     def is_raw(self) -> bool:
-        """Whether it describes raw numbers."""
+        """Whether the description is that of raw numbers."""
         return self.shape is not None or self.type is not None or self.big_endian
 
 
@@ -103,60 +101,60 @@ def read_counts(
     Parameters
     ----------
     path
-        .npy, .npz, .h5, nuclear medicine DICOM of several frames (.dcm), MetaImage (.mhd, .mha, as GATE 10 writes), the
-        header of an Interfile pair (.hdr, as GATE 9 writes), or raw numbers. A file of one frame may have only two axes.
+        Files: .npy, .npz, .h5, nuclear medicine DICOM of several frames (.dcm), MetaImage (.mhd, .mha, as GATE 10 writes),
+        the header of an Interfile pair (.hdr, as GATE 9 writes), or raw numbers. A file of one frame may have two axes.
     dataset
-        Name of the array in .npz and .h5, where they hold several of three axes.
+        Name of the array in .npz and .h5 files with several arrays of three axes.
     shape, type, big_endian
-        Of raw files: (frames, rows, columns), one of uint8, int8, … float64, and the order of the bytes.
+        Shape (frames, rows, columns), type (uint8, int8, … float64) and byte order of raw files.
     progress
-        Counts files.
+        Called after each file.
 
     Returns
     -------
     Counts
-        An array of three axes, frames, rows and columns, of the file's own type. `counts_run` checks its numbers, and
-        compares its arguments with the exposure, pixel size and energy windows in the file.
+        Array (frames, rows, columns) of the file's own type. `counts_run` checks its numbers, and compares its arguments
+        with the exposure, pixel size and energy windows in the file.
     """
-    layout = Layout(dataset, shape, type, big_endian)
+    layout = CountsLayout(dataset, shape, type, big_endian)
     paths = [Path(path)] if isinstance(path, str | os.PathLike) else list(map(Path, path))
     if not paths:
         raise InputError("counts: expected a file, or several")
-    found: list[Counts] = []
-    for number, one in enumerate(paths, 1):
-        found.append(_read(one, layout))
-        first, last = found[0].shape[1:], found[-1].shape[1:]
+    parts: list[Counts] = []
+    for number, file in enumerate(paths, 1):
+        parts.append(_read_file(file, layout))
+        first, last = parts[0].shape[1:], parts[-1].shape[1:]
         if first != last:
             size = f"{last[0]} x {last[1]} pixels, {paths[0]} of {first[0]} x {first[1]}"
-            raise InputError(f"{one}: it holds frames of {size}; expected one size")
+            raise InputError(f"{file}: it holds frames of {size}; expected one size")
         tell(progress, number, len(paths))
-    counts = found[0] if len(found) == 1 else np.concatenate(found).view(Counts)
-    counts.about = np.concatenate([one.about for one in found])
-    starts = counts.about[:, 4]  # until here after the day's beginning or that of an era
+    counts = parts[0] if len(parts) == 1 else np.concatenate(parts).view(Counts)
+    counts.about = np.concatenate([part.about for part in parts])
+    starts = counts.about[:, 4]  # as read, from the beginning of the day or of an era
     starts -= np.min(starts, initial=np.inf, where=np.isfinite(starts))
-    counts.kind = ", ".join(sorted({one.kind for one in found} - {""}))
-    counts.name = ", ".join([*(one.name for one in paths[:3]), *(["…"] if len(paths) > 3 else [])])
+    counts.kind = ", ".join(sorted({part.kind for part in parts} - {""}))
+    counts.name = ", ".join([*(file.name for file in paths[:3]), *(["…"] if len(paths) > 3 else [])])
     return counts
 
 
-def _read(path: Path, layout: Layout) -> Counts:
+def _read_file(path: Path, layout: CountsLayout) -> Counts:
+    """Return the frames of one file; raise `InputError`, which names the file, if they cannot be read."""
     require_file(path)
     ending = path.suffix.lower()
     with reading(path, ending or "counts"):
         if layout.is_raw:
-            return _counts(_raw(path, layout))
-        if layout.dataset is not None and ending not in (".npz", *_HDF5):
+            return _checked_frames(_read_raw(path, layout))
+        if layout.dataset is not None and ending not in (".npz", ".h5", ".hdf5"):
             raise InputError("dataset (--dataset) names an array in .npz and .h5; this file has no names")
         return _reader(path, ending)(path, layout)
 
 
-def _reader(path: Path, ending: str) -> Callable[[Path, Layout], Counts]:
-    """What reads a file."""
-    for endings, read in ((_NUMPY, _numpy), (_HDF5, _hdf5), (_META, _metaimage), (_INTERFILE, _interfile)):
-        if ending in endings:
-            return read
-    if ending == ".dcm" or is_dicom(path):
-        return _dicom
+def _reader(path: Path, ending: str) -> Callable[[Path, CountsLayout], Counts]:
+    """Return the function that reads a file with this ending, in lower case."""
+    if ending in _READERS:
+        return _READERS[ending]
+    if is_dicom(path):
+        return _read_dicom
     header = path.with_suffix(".hdr")
     beside = f"its header {header.name}, which is beside it, or " if header.is_file() else ""
     raise InputError(
@@ -165,12 +163,11 @@ def _reader(path: Path, ending: str) -> Callable[[Path, Layout], Counts]:
     )
 
 
-def _counts(array: Array, kind: str = "", **known: Sequence[float]) -> Counts:
-    """Checked frames, with an axis of frames also where there is only one, and what is `known` about them from the file.
+def _checked_frames(array: Array, kind: str = "", **facts: Sequence[float]) -> Counts:
+    """Return an array as frames (frames, rows, columns) with the `facts` of its file; raise `InputError` for another shape.
 
-    That is their `time` (s), `pixel` (along a row and down the columns, mm), energy `window` (number) with its `low` and
-    `high` energy (keV), and `start` (s after any moment). Of these, fewer than frames are those of blocks of frames, which
-    follow each other.
+    Facts are `time` (s), `pixel` (sizes along a row and down the columns, mm), energy `window` (numbers) with `low` and
+    `high` energies (keV), and `start` (s after any moment). Fewer values than frames are those of equal blocks of frames.
     """
     array = array[None] if array.ndim == 2 else array
     if array.ndim != 3 or not array.size:
@@ -178,80 +175,83 @@ def _counts(array: Array, kind: str = "", **known: Sequence[float]) -> Counts:
     if array.dtype.kind not in "fiu":
         raise InputError(f"expected whole or real numbers, found {array.dtype}")
     counts = array.view(Counts)
-    counts.kind, counts.about[:, 1:3] = kind, known.get("pixel", math.nan)
+    counts.kind, counts.about[:, 1:3] = kind, facts.get("pixel", math.nan)
     for column, name in ((0, "time"), (3, "window"), (4, "start"), (5, "low"), (6, "high")):
-        each = np.array(known.get(name) or [math.nan])
-        counts.about[:, column] = each[np.arange(len(array)) * len(each) // len(array)]
+        values = np.array(facts.get(name) or [math.nan])
+        counts.about[:, column] = values[np.arange(len(array)) * len(values) // len(array)]
     return counts
 
 
 def _require_memory(shape: Sequence[int], itemsize: int) -> None:
-    # The numbers, their float32 images, and the checks of them.
+    """Raise `InputError` unless there is memory for the numbers, their float32 images, and masks for the checks."""
     require((itemsize + 9.0) * math.prod(map(int, shape)), f"counts of {shape_text(tuple(shape))}")
 
 
-def _raw(path: Path, layout: Layout) -> Array:
+def _read_raw(path: Path, layout: CountsLayout) -> Array:
+    """Return the numbers of a raw file in the described shape (frames, rows, columns)."""
     if layout.shape is None or layout.type is None:
         shape, kind = "shape (--raw-shape FRAMES ROWS COLUMNS)", "type (--raw-type, uint16 or so)"
         raise InputError(f"raw numbers need their {shape if layout.shape is None else kind}")
     one_of(layout.type, RAW_TYPES, "raw type")
     type_ = np.dtype(layout.type).newbyteorder(">" if layout.big_endian else "<")
-    return _numbers(path, type_, whole_shape(layout.shape, "raw shape (--raw-shape)", 3))
+    return _file_numbers(path, type_, whole_shape(layout.shape, "raw shape (--raw-shape)", 3))
 
 
-def _numbers(path: Path, kind: np.dtype[Any], shape: tuple[int, ...], skip: int = 0) -> Array:
-    """All numbers of a file behind its first `skip` bytes."""
+def _file_numbers(path: Path, kind: np.dtype[Any], shape: tuple[int, ...], skip: int = 0) -> Array:
+    """Return all numbers of a file after its first `skip` bytes."""
     needed, size = skip + kind.itemsize * math.prod(shape), path.stat().st_size
     if needed != size:
         behind = f" behind {skip} bytes" if skip else ""
-        what = f"{shape_text(shape)} numbers of {kind.itemsize} bytes{behind}"
-        raise InputError(f"expected {needed} bytes ({what}), {path.name} has {size}")
+        expected = f"{shape_text(shape)} numbers of {kind.itemsize} bytes{behind}"
+        raise InputError(f"expected {needed} bytes ({expected}), {path.name} has {size}")
     _require_memory(shape, kind.itemsize)
     return np.fromfile(path, kind, offset=skip).reshape(shape)
 
 
-def _numpy(path: Path, layout: Layout) -> Counts:
+def _read_numpy(path: Path, layout: CountsLayout) -> Counts:
+    """Return the frames of a .npy or .npz file."""
     arrays = numpy_files.load(path)
-    return _counts(arrays["" if path.suffix.lower() == ".npy" else _chosen(arrays, layout)])
+    return _checked_frames(arrays["" if path.suffix.lower() == ".npy" else _array_name(arrays, layout)])
 
 
-def _hdf5(path: Path, layout: Layout) -> Counts:
+def _read_hdf5(path: Path, layout: CountsLayout) -> Counts:
+    """Return the frames of an HDF5 file."""
     import h5py
 
     with opened(path, whole=True) as file:
         arrays = datasets(file)
         if layout.dataset is not None and isinstance(file.get(layout.dataset), h5py.Dataset):
-            arrays[layout.dataset.strip("/")] = file[layout.dataset]  # of an array's names, the visit gives one
-        dataset = arrays[_chosen(arrays, layout)]
+            arrays[layout.dataset.strip("/")] = file[layout.dataset]  # `datasets` has one of an array's names
+        dataset = arrays[_array_name(arrays, layout)]
         _require_memory(dataset.shape, dataset.dtype.itemsize)
-        return _counts(read_numbers(dataset))
+        return _checked_frames(read_numbers(dataset))
 
 
-def _chosen(arrays: dict[str, Any], layout: Layout) -> str:
-    """The name of the array that is meant: the one that is named, or the only one of three axes."""
-    found = [name for name, array in arrays.items() if array.ndim == 3]
+def _array_name(arrays: dict[str, Any], layout: CountsLayout) -> str:
+    """Return the name of the array with the frames: the one that the user names, or the only one of three axes."""
+    three_axes = [name for name, array in arrays.items() if array.ndim == 3]
     if layout.dataset is not None:
         name = layout.dataset.strip("/")
         if name not in arrays:
             raise InputError(f"no dataset {layout.dataset!r} in it; there are: {', '.join(arrays) or 'none'}")
         return name
-    if len(found) != 1:
-        there = ", ".join(f"{name} ({' x '.join(map(str, a.shape))})" for name, a in arrays.items()) or "none"
-        raise InputError(f"{len(found) or 'no'} arrays of three axes in it; say which (--dataset NAME): {there}")
-    return found[0]
+    if len(three_axes) != 1:
+        listed = ", ".join(f"{name} ({' x '.join(map(str, a.shape))})" for name, a in arrays.items()) or "none"
+        raise InputError(f"{len(three_axes) or 'no'} arrays of three axes in it; say which (--dataset NAME): {listed}")
+    return three_axes[0]
 
 
-def _metaimage(path: Path, layout: Layout) -> Counts:
-    """GATE 10's projections: x along a row, y down the rows, a frame in each z."""
-    with recorded_warnings() as unsaid:  # that it does not say how it lies, which is asked anyway
+def _read_metaimage(path: Path, layout: CountsLayout) -> Counts:
+    """Return the frames of a MetaImage file as GATE 10 writes projections: x along a row, y down the rows, a frame per z."""
+    with recorded_warnings() as orientation_warnings:  # the user gives the orientation anyway
         contents = metaimage.read(path)
-    affine = np.full((4, 4), math.nan) if contents.affine is None or unsaid else contents.affine
+    affine = np.full((4, 4), math.nan) if contents.affine is None or orientation_warnings else contents.affine
     pixel = np.linalg.norm(affine[:3, :2], axis=0).tolist()
-    return _counts(np.ascontiguousarray(contents.array.transpose(2, 1, 0)), pixel=pixel)
+    return _checked_frames(np.ascontiguousarray(contents.array.transpose(2, 1, 0)), pixel=pixel)
 
 
-def _interfile(path: Path, layout: Layout) -> Counts:
-    """An Interfile 3.3 header and the file of numbers that it names, as GATE 9's projections are.
+def _read_interfile(path: Path, layout: CountsLayout) -> Counts:
+    """Return the frames of an Interfile 3.3 header and the file of numbers that it names, as GATE 9 writes projections.
 
     Reference: A. Todd-Pokropek, T. D. Cradduck, F. Deconinck, "A file format for the exchange of nuclear medicine image
     data: a specification of Interfile version 3.3", Nuclear Medicine Communications 13 (1992) 673-699.
@@ -262,13 +262,13 @@ def _interfile(path: Path, layout: Layout) -> Counts:
         return header.get(key, [default])[0]
 
     def number(key: str, default: float | None = None) -> float:
-        found = text(key, "" if default is None else str(default))
+        text_value = text(key, "" if default is None else str(default))
         try:
-            value = float(found)
+            value = float(text_value)
         except ValueError:
             value = math.nan
         if not math.isfinite(value):
-            raise InputError(f"{key} := {found}: expected a number" if found else f"it has no {key!r}")
+            raise InputError(f"{key} := {text_value}: expected a number" if text_value else f"it has no {key!r}")
         return value
 
     columns, rows = (int(number(f"matrix size [{i}]")) for i in (1, 2))
@@ -286,26 +286,26 @@ def _interfile(path: Path, layout: Layout) -> Counts:
     count = int(number("total number of images", (data.stat().st_size - skip) // frame if frame else 0))
     keys = (f"{name} (sec)" for name in ("time per projection", "image duration", "study duration"))
     times = next((list(map(float, header[key])) for key in keys if any(header.get(key, ()))), [])
-    starts = [float(each) for each in header.get("image relative start time (sec)", ()) if each]
-    starts = starts or [_seconds_of_day(each) for each in header.get("image start time", ()) if each]
+    starts = [float(start) for start in header.get("image relative start time (sec)", ()) if start]
+    starts = starts or [_seconds_of_day(start) for start in header.get("image start time", ()) if start]
     windows = int(number("number of energy windows", 1))
     pixel = [float(text(f"scaling factor (mm/pixel) [{i}]", "nan")) for i in (1, 2)]
     kind = f"{windows} energy windows" if windows > 1 else ""
-    frames = _numbers(data, type_, (count, rows, columns), skip)
-    of_windows: Any = {"window": range(1, windows + 1)}
+    frames = _file_numbers(data, type_, (count, rows, columns), skip)
+    limits: Any = {"window": range(1, windows + 1)}
     for name, word in (("low", "lower"), ("high", "upper")):
-        of_windows[name] = [float(text(f"energy window {word} level [{i}]", "nan")) for i in of_windows["window"]]
-    return _counts(frames, kind, time=times, pixel=pixel, start=starts, **of_windows)
+        limits[name] = [float(text(f"energy window {word} level [{i}]", "nan")) for i in limits["window"]]
+    return _checked_frames(frames, kind, time=times, pixel=pixel, start=starts, **limits)
 
 
 def _seconds_of_day(text: str) -> float:
-    """Of a time such as 14:05:30, or DICOM's 140530.25."""
+    """Return the seconds since midnight of a time such as 14:05:30, or 140530.25 in DICOM."""
     digits = text.replace(":", "")
     return 3600.0 * int(digits[:2]) + 60.0 * int(digits[2:4] or 0) + float(digits[4:] or 0)
 
 
 def _interfile_header(path: Path) -> dict[str, list[str]]:
-    """Keys, in lower case, and their values: several where a key stands there several times."""
+    """Return the values of a header by its keys, in lower case; a repeated key has several."""
     lines = path.read_bytes()[: 1 << 20].decode("latin-1").splitlines()
     if not lines or not lines[0].lstrip("!").strip().upper().startswith("INTERFILE"):
         raise InputError("not an Interfile header: expected !INTERFILE in the first line")
@@ -319,15 +319,15 @@ def _interfile_header(path: Path) -> dict[str, list[str]]:
 
 
 def _interfile_data(path: Path, name: str) -> Path:
-    """The file of numbers: where the header says, or of that name beside it, since it may have been moved with it."""
-    for found in (path.parent / name, path.parent / Path(name.replace("\\", "/")).name):
-        if name and found.exists():
-            return require_file(found)
+    """Return the file of numbers: at the header's path, or beside the header, since both may have been moved together."""
+    for candidate in (path.parent / name, path.parent / Path(name.replace("\\", "/")).name):
+        if name and candidate.exists():
+            return require_file(candidate)
     raise InputError(f"its numbers are in {name or 'no file that it names'}, which is not beside it")
 
 
-def _dicom(path: Path, layout: Layout) -> Counts:
-    """A nuclear medicine image of several frames (DICOM part 3, C.8.4.8): planar images or projections."""
+def _read_dicom(path: Path, layout: CountsLayout) -> Counts:
+    """Return the frames of a nuclear medicine image (DICOM part 3, C.8.4.8): planar images or projections."""
     import pydicom
 
     data = pydicom.dcmread(path)
@@ -342,70 +342,84 @@ def _dicom(path: Path, layout: Layout) -> Counts:
     slope, intercept = float(data.get("RescaleSlope") or 1), float(data.get("RescaleIntercept") or 0)
     if (slope, intercept) != (1.0, 0.0):
         array = array * slope + intercept
-    several = {name: int(data.get(f"NumberOf{name.replace(' ', '')}s") or 1) for name in _VECTORS}
-    kind = ", ".join(f"{n} {name.lower()}s" for name, n in several.items() if n > 1)
+    numbers = {name: int(data.get(f"NumberOf{name.replace(' ', '')}s") or 1) for name in _VECTORS}
+    kind = ", ".join(f"{n} {name.lower()}s" for name, n in numbers.items() if n > 1)
     pixel = [float(size) for size in data.get("PixelSpacing") or (math.nan, math.nan)][::-1]
-    windows = _which(data, "Energy Window", several["Energy Window"])
-    low, high = ([_dicom_energy(data, number, word) for number in windows] for word in ("Lower", "Upper"))
-    times, starts = _dicom_times(data), _dicom_starts(data, len(array))
-    return _counts(array, kind, time=times, pixel=pixel, window=windows, start=starts, low=low, high=high)
+    windows = _frame_parts(data, "Energy Window", numbers["Energy Window"])
+    low, high = ([_window_limit(data, number, word) for number in windows] for word in ("Lower", "Upper"))
+    times, starts = _frame_durations(data), _frame_starts(data, len(array))
+    return _checked_frames(array, kind, time=times, pixel=pixel, window=windows, start=starts, low=low, high=high)
 
 
 _VECTORS = ("Energy Window", "Detector", "Phase", "Rotation", "RR Interval", "Time Slot")
-"""What a nuclear medicine image may have several of."""
+"""Properties of frames of which a nuclear medicine image may have several values."""
 
 
-def _dicom_times(data: Any) -> list[float]:
-    """The durations of frames, s: of each by its rotation or phase, or of all."""
+def _frame_durations(data: Any) -> list[float]:
+    """Return the exposures of frames, s: those of each frame's rotation or phase, or one for all frames."""
     for name in ("Rotation", "Phase"):
-        parts = [_dicom_time(part) for part in data.get(f"{name}InformationSequence") or ()]
-        if any(map(math.isfinite, parts)):
-            return [parts[number - 1] for number in _which(data, name, len(parts))]
-    return [_dicom_time(data)]
+        durations = [_frame_duration(part) for part in data.get(f"{name}InformationSequence") or ()]
+        if any(map(math.isfinite, durations)):
+            return [durations[number - 1] for number in _frame_parts(data, name, len(durations))]
+    return [_frame_duration(data)]
 
 
-def _dicom_energy(data: Any, number: int, word: str) -> float:
-    """The lower or the upper limit of the energy window of a number, keV; NaN of one that is not a single range."""
+def _window_limit(data: Any, number: int, word: str) -> float:
+    """Return the "Lower" or "Upper" limit of the energy window `number`, keV; NaN if the window is not a single range."""
     windows = data.get("EnergyWindowInformationSequence") or ()
     ranges: Any = windows[number - 1].get("EnergyWindowRangeSequence") or () if 0 < number <= len(windows) else ()
     limit = ranges[0].get(f"EnergyWindow{word}Limit") if len(ranges) == 1 else None
     return math.nan if limit is None else float(limit)
 
 
-def _dicom_starts(data: Any, count: int) -> list[float]:
-    """When frames started, s of an era: the acquisition, and in it each phase and its frames (C.8.4.8, C.8.4.14).
+def _frame_starts(data: Any, count: int) -> list[float]:
+    """Return the starts of frames, s of an era, from those of the acquisition, its phases and frames (C.8.4.8, C.8.4.14).
 
-    Nothing where the file says neither a time nor phases, and of rotations, whose views follow each other unsaid.
+    The list is empty if the file states neither a time nor phases, and for rotations, whose views have no stated starts.
     """
     day, clock = str(data.get("AcquisitionDate") or ""), str(data.get("AcquisitionTime") or "")
     phases = data.get("PhaseInformationSequence") or ()
     if not (clock or phases) or data.get("RotationInformationSequence"):
         return []
-    begun = 86400.0 * date.fromisoformat(day).toordinal() if day else 0.0
-    begun += _seconds_of_day(clock) if clock else 0.0
+    start = 86400.0 * date.fromisoformat(day).toordinal() if day else 0.0
+    start += _seconds_of_day(clock) if clock else 0.0
     if not phases:
-        return [begun]
-    ends, firsts, apart = begun, [], []
+        return [start]
+    phase_end, phase_starts, frame_steps = start, [], []
     for phase in phases:
-        duration, pause = _dicom_time(phase), float(phase.get("PauseBetweenFrames") or 0) / 1000
-        firsts.append(ends + float(phase.get("PhaseDelay") or 0) / 1000)
-        apart.append(duration + pause)
-        ends = firsts[-1] + int(phase.get("NumberOfFramesInPhase") or 1) * apart[-1] - pause
+        duration, pause = _frame_duration(phase), float(phase.get("PauseBetweenFrames") or 0) / 1000
+        phase_starts.append(phase_end + float(phase.get("PhaseDelay") or 0) / 1000)
+        frame_steps.append(duration + pause)
+        phase_end = phase_starts[-1] + int(phase.get("NumberOfFramesInPhase") or 1) * frame_steps[-1] - pause
     slices = data.get("TimeSliceVector")
-    of_frames = zip(_which(data, "Phase", len(phases)), [1] * count if slices is None else list(slices), strict=False)
-    return [firsts[phase - 1] + (number - 1) * apart[phase - 1] for phase, number in of_frames]
+    numbers = [1] * count if slices is None else list(slices)  # of the frames in their phases
+    frames = zip(_frame_parts(data, "Phase", len(phases)), numbers, strict=False)
+    return [phase_starts[phase - 1] + (number - 1) * frame_steps[phase - 1] for phase, number in frames]
 
 
-def _which(data: Any, name: str, count: int) -> list[int]:
-    """Which of `count` windows, rotations or phases each frame is of; unsaid, those of blocks of frames."""
+def _frame_parts(data: Any, name: str, count: int) -> list[int]:
+    """Return the number, 1 to `count`, of each frame's window, rotation or phase; without a vector, one for each block."""
     vector = data.get(f"{name.replace(' ', '')}Vector") or np.arange(1, count + 1)
     return [int(number) for number in np.atleast_1d(vector)]
 
 
-def _dicom_time(place: Any) -> float:
+def _frame_duration(place: Any) -> float:
+    """Return the exposure, s, that a DICOM dataset states; NaN if it states none."""
     return float(place.get("ActualFrameDuration") or math.nan) / 1000
 
 
-def differs(recorded: float, other: float) -> bool:
-    """Whether a length or time in a file, NaN where there is none, is more than its rounding from another."""
-    return not (math.isnan(recorded) or math.isclose(recorded, other, rel_tol=_SAME_SIZE))
+def differs(recorded: float, expected: float) -> bool:
+    """Return whether a length or time in a file differs from `expected` by more than rounding; False for NaN in the file."""
+    return not (math.isnan(recorded) or math.isclose(recorded, expected, rel_tol=_SAME_SIZE))
+
+
+_READERS: dict[str, Callable[[Path, CountsLayout], Counts]] = {
+    **dict.fromkeys((".npy", ".npz"), _read_numpy),
+    **dict.fromkeys((".h5", ".hdf5"), _read_hdf5),
+    ".dcm": _read_dicom,
+    **dict.fromkeys((".mhd", ".mha"), _read_metaimage),
+    **dict.fromkeys((".hdr", ".h33", ".hs"), _read_interfile),
+}
+"""Readers by the endings of their files, in lower case."""
+COUNTS_FORMATS = (*_READERS, ".raw", ".bin", ".dat")
+"""Endings of files with counts; DICOM files and raw files may have any name."""

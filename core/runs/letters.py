@@ -1,4 +1,4 @@
-"""Text in pictures, in any size: a proportional typeface, smoothed, so that pictures need no library that draws."""
+"""Text in pictures, in any size: a smoothed proportional typeface, so that pictures need no drawing library."""
 
 import base64
 import functools
@@ -9,36 +9,36 @@ from pathlib import Path
 import numpy as np
 
 from ..arrays import Floats32
-from .resizing import resized
+from .display import resize_picture
 
 _CHARACTERS = "".join(map(chr, range(32, 127))) + "µ²³·×°±−–αβθφψΣ∫"
 _EM, _ROWS, _BASELINE = 48, 51, 39
-"""Pixels to the em of the stored letters, their height, and the row on which they stand."""
-# DejaVu Sans; its licence is free for any use. A byte for each character's width, then one bit a pixel, column by column:
-# where ink begins or ends along a row.
+"""Pixels per em of the stored letters, their height, and the row of their baseline."""
+# DejaVu Sans, whose licence allows any use: a byte for the width of each character, then one bit per pixel, column by
+# column, which is 1 where ink begins or ends along a row.
 _BITS = Path(__file__).with_name("letters.txt")
 
 
-def lettered(text: str, size: float) -> tuple[Floats32, float]:
-    """A line of text, `size` pixels to the em: how much ink is where (rows, columns), 0 to 1, and the baseline's row.
+def text_ink(text: str, size: float) -> tuple[Floats32, float]:
+    """Return the ink of a line of text (rows, columns), 0 to 1, `size` pixels per em, and the row of the baseline.
 
-    A character that is not known is "?".
+    An unknown character is drawn as "?".
     """
     letters = _letters()
     ink = np.concatenate([letters.get(character, letters["?"]) for character in text or " "], axis=1)
     share = size / _EM
     shape = max(1, round(ink.shape[0] * share)), max(1, round(ink.shape[1] * share))
-    return resized(ink[..., None], *shape)[..., 0], _BASELINE * shape[0] / _ROWS
+    return resize_picture(ink[..., None], *shape)[..., 0], _BASELINE * shape[0] / _ROWS
 
 
 def width(text: str, size: float) -> float:
-    """Pixels that a line of text takes along its baseline."""
+    """Return the width, pixels, of a line of text."""
     letters = _letters()
     return sum(letters.get(character, letters["?"]).shape[1] for character in text) * size / _EM
 
 
-def wrapped(text: str, fits: Callable[[str], bool]) -> list[str]:
-    """A text as lines that fit, where it has spaces."""
+def wrap_text(text: str, fits: Callable[[str], bool]) -> list[str]:
+    """Return a text as lines for which `fits` returns True, broken at spaces."""
     lines = [""]
     for word in text.split():
         longer = f"{lines[-1]} {word}".strip()
@@ -51,7 +51,7 @@ def wrapped(text: str, fits: Callable[[str], bool]) -> list[str]:
 
 @functools.cache
 def _letters() -> dict[str, Floats32]:
-    """Each character's ink (rows, its width)."""
+    """Return the ink (rows, width) of each character."""
     stored = np.frombuffer(zlib.decompress(base64.b85decode(_BITS.read_bytes().strip())), np.uint8)
     widths, bits = stored[: len(_CHARACTERS)].astype(int), np.unpackbits(stored[len(_CHARACTERS) :])
     flips = bits[: widths.sum() * _ROWS].reshape(-1, _ROWS)

@@ -1,8 +1,8 @@
 """Physics presets: settings of SPECT counts that are chosen together, as entries of a recipe.
 
-A preset names an isotope, the aperture's material and the crystal's; their numbers are those of `physics.isotopes` and
-`physics.materials`, at the isotope's energies. What belongs to an acquisition or to one camera stays as it is: time, noise,
-attenuation, the detector's own blur, the opening angle.
+A preset names an isotope and the materials of aperture and crystal; their numbers come from `physics.isotopes` and
+`physics.materials`, at the isotope's energies. Settings of an acquisition or of one camera stay unchanged: time, noise,
+attenuation, the detector's own blur, the opening angle. To add a preset, add a row to `_ROWS`.
 """
 
 from collections.abc import Mapping
@@ -13,29 +13,34 @@ _RESET = (
     *("isotope", "window", "aperture_points", "aperture_tolerance", "hole", "aperture_mu", "edge", "plate_thickness"),
     *("wall_thickness", "crystal_mu", "depth_layers", "within_cone", "within_walls", "within_crystal"),
 )
-"""Settings of the model that every preset decides: those that it does not give have their defaults."""
+"""Settings of the model that every preset decides; those that a preset does not give get their defaults."""
 
 _REAL = {"within_cone": True, "within_walls": True, "within_crystal": True}
-"""A hole with a size in a plate, with walls and a crystal of finite size."""
+"""Settings of a hole of finite size in a plate, of walls, and of a crystal of finite size."""
 
 
 @dataclass(frozen=True)
 class Preset:
-    """Settings that are chosen together."""
+    """Settings of a model that are chosen together."""
 
-    name: str  # such as "tc99m-tungsten-czt"
-    label: str  # as menus show it
+    name: str
+    """Name on the command line, such as "tc99m-tungsten-czt"."""
+    label: str
+    """Name in menus."""
     text: str
-    model: Mapping[str, Any]  # by the names of the table `model`
+    """Help text of one line."""
+    model: Mapping[str, Any]
+    """Values by the settings' names in the table [model]."""
 
     @property
     def changes(self) -> dict[str, Any]:
-        """What it changes in a recipe (`Recipe.updated`), None for what it takes away."""
+        """Changes of a recipe for `Recipe.updated`; None removes a value."""
         values = {**dict.fromkeys(_RESET), "kind": "emission", **self.model}
         return {f"model.{name}": value for name, value in values.items()}
 
 
 def _camera(isotope: str, aperture: str, crystal: str) -> Preset:
+    """Return the preset of a real camera with these names of isotope and materials."""
     label = f"{isotope}, {aperture.capitalize()}, {crystal}"
     text = f"{isotope}'s photons through a hole in {aperture} into {crystal}, with the hole's size, edge and walls"
     name = f"{isotope.replace('-', '')}-{aperture}-{crystal}".lower()
@@ -60,4 +65,4 @@ _ROWS = (
     _camera("Lu-177", "tungsten", "NaI"),
 )
 PRESETS: Mapping[str, Preset] = {preset.name: preset for preset in _ROWS}
-"""The presets by name."""
+"""Presets by name."""

@@ -1,58 +1,61 @@
-"""From a system and a volume to images and to a projection run: the main job, as one call."""
+"""Simulation of images: a volume is projected into all modules of a system, and becomes a projection run."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
 from ..arrays import Array, ArrayLike, Floats32
 from ..errors import InputError, warn
 from ..geometry.scanner import Detector, Scanner
-from ..geometry.system import PinholeSystem
 from ..geometry.views import Views
 from ..memory import require
-from ..models.coefficient_checks import mu_warnings
 from ..physics.dead_time import dead_time_counts
 from ..physics.isotopes import photon_energy
 from ..physics.noise import sample_counts
 from ..progress import Progress
-from ..projector import Emission, Model, Projector, Transmission, intensity
+from ..projector import Model, Projector, intensity
 from ..validation import positive, seed_number
 from ..volumes.volume import Volume
-from ..xray.scan import SpectralScan
-from .counting import scaled
+from .counting import scale_by_module
 from .run import ProjectionRun
 
 LINES = "lines"
-"""In place of the energy at which CT numbers become mu: they attenuate each line of the isotope at its own."""
+"""Word in place of the energy at which CT numbers become mu: they attenuate each line of the isotope at its own energy."""
 
 
 @dataclass(frozen=True, eq=False)
 class Imaging:
-    """Makes images of volumes: the one route of runs, reconstructions and events, with the same warnings for all."""
+    """Simulator of a volume's images with one model: projection, background, dead time, and the warnings about them.
+
+    Runs, reconstructions and event sets all make their images with it.
+    """
 
     projector: Projector
-    photons: float | None = None  # as for `project_run`
-    dead_time: tuple[float, str] = (0.0, "non-paralysable")  # of each module, s, and its kind
+    photons: float | None = None
+    """Photons per pixel of an X-ray source, see `project_run`."""
+    dead_time: tuple[float, str] = (0.0, "non-paralysable")
+    """Dead time of each module, s, and its kind."""
 
     @property
     def model(self) -> Model:
-        """What a pixel measures."""
+        """Model of the images."""
         return self.projector.model
 
     def images(self, volume: Volume, mu: Floats32 | None = None, progress: Progress | None = None) -> Floats32:
-        """The expected images (M, n_v, n_u) of a volume: the background included, less what dead time takes."""
+        """Return the expected images (M, n_v, n_u) of a volume, with the background and the losses by dead time."""
         images = self.expected(volume, mu, progress)
         images *= self.recorded_shares(images)
         return images
 
     def recorded_shares(self, images: Floats32) -> Floats32:
-        """The shares (M, 1, 1) of expected images that modules record beside their dead time; a warning says where they
-        are beyond what a paralysable counter can record, so that the counts are those of a smaller rate.
+        """Return the fractions (M, 1, 1) of expected `images` (M, n_v, n_u) that the modules record despite their dead time.
+
+        Warns of modules at rates beyond the maximum of a paralysable counter, whose counts could be those of a lower rate.
         """
-        (tau, kind), model = self.dead_time, self.model
-        if not tau or not isinstance(model, Emission):
+        (tau, kind), model = self.dead_time, cast(Any, self.model)
+        if not tau or not model.has_times:
             return np.ones((1, 1, 1), np.float32)
         totals = np.maximum(images.sum(axis=(1, 2), dtype=float), 1e-30)
         if kind == "paralysable" and (beyond := totals / model.time > 1 / tau).any():
@@ -62,31 +65,35 @@ class Imaging:
         return recorded.astype(np.float32)[:, None, None]
 
     def expected(self, volume: Volume, mu: Floats32 | None = None, progress: Progress | None = None) -> Floats32:
-        """The expected images (M, n_v, n_u) of a volume, the background included, without dead time.
+        """Return the expected images (M, n_v, n_u) of a volume, with the background, without dead time.
 
-        `mu`, 1/mm, attenuates in place of the model's, on whose grid it is. `progress` is called after every view.
-        `InputError` where the model has no meaning for the volume. Warnings say where images hardly are what is wanted.
+        Parameters
+        ----------
+        volume
+            Volume of a quantity that the model can image, else `InputError` is raised.
+        mu
+            Attenuation, 1/mm, in place of the model's, on the same grid.
+        progress
+            Called after every view.
+
+        Warns of volumes and views whose images are probably not the intended ones.
         """
         A = self.projector
         self.model.check_volume(volume)
-        if self.photons is not None and not (isinstance(self.model, Transmission) and volume.quantity == "mu"):
-            what = f"{self.model.name} of {volume.quantity}"
-            raise InputError(f"photons: expected the transmission of a volume of mu, got {what}")
+        if self.photons is not None and not (self.model.has_photons and volume.quantity == "mu"):
+            text = f"{self.model.name} of {volume.quantity}"
+            raise InputError(f"photons: expected the transmission of a volume of mu, got {text}")
         warn_of_images(volume, A.views, self.model)
-        if mu is not None and isinstance(self.model, Emission):
-            for text in mu_warnings(mu, self.model):
-                warn(text)
-        if isinstance(self.model, SpectralScan):
-            images = self.model.counts(volume, A, progress)
-        else:
-            images = np.asarray(A(volume, progress, mu))
+        for text in () if mu is None else self.model.mu_warnings(mu):
+            warn(text)
+        images = self.model.expected_images(A, volume, progress, mu)
         for image, background in zip(images, A.background, strict=True):
             passed = image if self.photons is None else intensity(image, self.photons)
             image[...] = passed + background.astype(image.dtype)
         return images.astype(np.float32, copy=False)
 
     def unit(self, volume: Volume) -> str:
-        """The unit of a volume's images."""
+        """Return the unit of a volume's images."""
         return self.model.unit(volume) if self.photons is None else "photons"
 
 
@@ -105,51 +112,56 @@ def project_run(
     noise_seed: int | None = None,
     progress: Progress | None = None,
     dead_time: tuple[float, str] = (0.0, "non-paralysable"),
+    noise: str = "poisson",
 ) -> ProjectionRun:
     """Project `volume` into every module of `system`.
 
     Parameters
     ----------
+    system, volume
+        Modules, and the volume that they image.
     shape, detector, magnification, pitch
-        The images, as for `PinholeSystem.views`.
+        Pixels and detector, see `PinholeSystem.views`.
     backend, threads
-        As for `Projector`.
+        See `Projector`.
     settings
-        More to record in the run.
+        Further entries of the run's record.
     model
-        `Transmission` (the default), an `Emission`, an `InverseSquareSum` or a `SpectralScan` of the same system.
+        `Transmission` (the default), or an `Emission`, an `InverseSquareSum` or a `SpectralScan` of the same system.
     photons
-        Photons of an X-ray source, per pixel: the run of a volume of mu holds those that pass (`intensity`), not line
-        integrals.
+        Photons per pixel of an X-ray source: the run of a volume of mu then holds the photons that pass (`intensity`)
+        instead of line integrals.
     noise_seed
-        With counts or `photons`: the run holds counts drawn with this seed (`sample_counts`), not their means.
+        Seed with which counts are drawn (`sample_counts`) for images of counts or `photons`; None for expected counts.
     progress
         Called after every view.
     dead_time
-        With an `Emission`: that of each module, s, and its kind, "non-paralysable" or "paralysable". The expected counts,
-        before noise, are less by it (`dead_time_counts`); the run's background is what is recorded of it.
+        Dead time of each module, s, and its kind, "non-paralysable" or "paralysable", for an `Emission`. It reduces the
+        expected counts, before noise is drawn (`dead_time_counts`), and the run's background.
+    noise
+        Model of the noise, see `sample_counts`.
 
     Raises
     ------
     InputError
-        A setting is out of range, the volume holds what the model has no meaning for, or the images do not fit into memory.
+        A setting is out of range, the model cannot image the volume's quantity, or the images do not fit into memory.
     """
     photons = None if photons is None else positive(photons, "photons")
     if noise_seed is not None:
-        if photons is None and not (isinstance(model, Emission | SpectralScan) and model.unit(volume) == "counts"):
+        if photons is None and (model is None or model.unit(volume) != "counts"):
             raise InputError("noise_seed: only counts of an Emission or of X rays, or photons that pass, have noise")
         noise_seed = seed_number(noise_seed)
     views = system.views(shape=shape, detector=detector, magnification=magnification, pitch=pitch)
     n_v, n_u = views.shape
-    each = 4.0 if noise_seed is None else 20.0  # bytes; counts are drawn from float64, as int64
-    require(each * len(views) * n_v * n_u, f"a set of {len(views)} projections of {n_v} x {n_u} pixels")
+    bytes_per_pixel = 4.0 if noise_seed is None else 20.0  # counts are drawn from float64, as int64
+    require(bytes_per_pixel * len(views) * n_v * n_u, f"a set of {len(views)} projections of {n_v} x {n_u} pixels")
     imaging = Imaging(Projector(volume.grid, views, model, backend, threads), photons, dead_time)
     model = imaging.model
     images = imaging.expected(volume, progress=progress)
     shares = imaging.recorded_shares(images)
     images *= shares
     if noise_seed is not None:
-        images = sample_counts(images, noise_seed).astype(np.float32)
+        images = sample_counts(images, noise_seed, noise).astype(np.float32)
     record = {
         "detector": detector, "magnification": float(magnification),
         "pitch_mm": None if pitch is None else np.broadcast_to(pitch, 2).tolist(), "model": model.name, **model.record(),
@@ -157,16 +169,16 @@ def project_run(
     }  # fmt: skip
     return ProjectionRun(
         images, system, views, volume, unit=imaging.unit(volume), settings=record, seed=noise_seed,
-        background=scaled(model.background, shares), efficiency=model.efficiency,
+        background=scale_by_module(model.background, shares), efficiency=model.efficiency,
     )  # fmt: skip
 
 
 def warn_of_energy(model: Model, energy: float | str | None, source: str) -> None:
-    """Warn where mu holds at an energy (keV, or an isotope's) whose photons the model does not count.
+    """Warn of mu that holds at an `energy` (keV, or an isotope's name) outside the model's energy window.
 
-    `source` names what the mu is of.
+    `source` names the file or phantom of the mu, for the message.
     """
-    window = model.window if isinstance(model, Emission) else None
+    window = model.detected_energies
     if window is None or energy in (None, LINES):
         return
     energy = photon_energy(energy)
@@ -176,30 +188,14 @@ def warn_of_energy(model: Model, energy: float | str | None, source: str) -> Non
 
 
 def warn_of_images(volume: Volume, views: Views, model: Model) -> None:
-    """Warn where images of a volume hardly are what is wanted: activity below 0, pixels beside crystals, unseen parts."""
-    lowest, highest = float(volume.array.min()), float(volume.array.max())
-    if isinstance(model, Emission) and lowest < -0.1 * abs(highest):  # interpolation leaves less
-        warn(f"the activity is {lowest:g} to {highest:g} kBq/mL: what is below 0 makes counts below 0")
-    if isinstance(model, Emission) and not model.within_crystal:
-        _warn_of_no_crystal(model.system, views)
-    _warn_of_unseen(volume, views, ends_at_plane=not isinstance(model, Emission))
-
-
-def _warn_of_no_crystal(system: PinholeSystem, views: Views) -> None:
-    """Warn where images of counts reach beyond the crystal."""
-    magnification = np.linalg.norm(views.detector_centers - views.sources, axis=1) / system.collimator_length
-    steps = np.stack([views.u_steps, views.v_steps])
-    sides = np.linalg.norm(steps, axis=2) * np.array(views.shape[::-1])[:, None] / magnification  # on the crystal, mm
-    beyond = int(np.any(sides > 1.001 * system.detector_side, axis=0).sum())
-    if beyond:
-        warn(
-            f"{beyond} of {len(views)} images are wider than the crystal: pixels beside it count photons that nothing "
-            "detects, unless within_crystal (Crystal's Side) leaves them out"
-        )
+    """Warn of activity below 0, pixels beside the crystals, and a volume that the modules do not see whole."""
+    for text in model.image_warnings(volume, views):
+        warn(text)
+    _warn_of_unseen(volume, views, model.ends_at_detector)
 
 
 def _warn_of_unseen(volume: Volume, views: Views, ends_at_plane: bool) -> None:
-    """Warn where a volume lies beside the isocentre, or beyond the plane at which the rays end."""
+    """Warn of a volume beside the isocentre, or beyond the plane at which the rays end (`ends_at_plane`)."""
     index = volume.grid.index_from_world[:3, 3]
     if np.any(index < -0.5) or np.any(index > np.array(volume.grid.shape) - 0.5):
         warn("the isocentre, at which the modules aim, lies outside the volume's grid: check the volume's position")

@@ -1,8 +1,7 @@
-"""Recipes: what a projection run was, or is to be, made from, and the TOML files that hold them."""
+"""Recipe of a projection run: the values of its settings, and the TOML file that holds them."""
 
 import dataclasses
 import os
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
 from typing import Any
@@ -10,53 +9,19 @@ from typing import Any
 from ..errors import InputError, naming
 from ..files import AnyPath, require_ending, write_bytes
 from ..phantoms.settings import setting_names
-from ..toml import read_toml, toml_value
-from .settings import SAMPLING, SETTINGS, TABLES, Setting, settings_with
+from ..recipes.settings import Setting
+from ..recipes.toml import read_toml, toml_value
+from ..recipes.values import Values, unmet_needs
+from .settings import SAMPLING, SETTINGS, TABLES, settings_with
 
-_PLACED = ("phantom.position", "phantom.euler_degrees")
-
-
-@dataclasses.dataclass(frozen=True)
-class Values(ABC):
-    """Values of settings by their keys; those that are not given have their defaults.
-
-    `InputError` for an unknown setting, a wrong value, and a setting without an effect beside the others.
-    """
-
-    given: Mapping[str, Any] = dataclasses.field(default_factory=dict)
-
-    @property
-    @abstractmethod
-    def rows(self) -> Mapping[str, Setting]:
-        """The settings that there are, by their keys."""
-
-    def __post_init__(self) -> None:
-        rows = self.rows
-        for key in self.given:
-            if key not in rows:
-                siblings = [other for other in rows if other.rpartition(".")[0] == key.rpartition(".")[0]]
-                if not siblings:
-                    tables = dict.fromkeys(other.partition(".")[0] for other in rows)
-                    raise InputError(f"{key}: expected TABLE.NAME with a table of {', '.join(tables)}")
-                known = ", ".join(other.rpartition(".")[2] for other in siblings)
-                raise InputError(f"{key}: no such setting; expected {known}")
-        checked = {key: rows[key].checked(value) for key, value in self.given.items()}
-        object.__setattr__(self, "given", checked)
-        for key in checked:
-            for need in _unmet(checked, key, rows):
-                names = map(_named, need.removeprefix("no ").split(" or "))
-                problem = "does not go with" if need.startswith("no ") else "needs"
-                raise InputError(f"{_named(key)} {problem} {' or '.join(names)}")
-
-    def __getitem__(self, key: str) -> Any:
-        return self.given[key] if key in self.given else self.rows[key].default
+_PLACEMENT = ("phantom.position", "phantom.euler_degrees")
 
 
 @dataclasses.dataclass(frozen=True)
 class Recipe(Values):
-    """What a projection run is made from: values of `settings.SETTINGS`, by their keys.
+    """Recipe of a projection run: values of `settings.SETTINGS` by their keys.
 
-    The settings of a phantom's class are there as ``"phantom.<name>"``.
+    The settings of a phantom's class have keys of the form ``"phantom.<name>"``.
 
     >>> recipe = Recipe({"system.file": "scanner.xlsx", "model.kind": "emission", "model.isotope": "Tc-99m"})
     >>> recipe["model.time"]
@@ -69,32 +34,40 @@ class Recipe(Values):
 
     @property
     def rows(self) -> Mapping[str, Setting]:
-        """All settings, with those of the phantom's kind."""
+        """Settings by their keys, those of the phantom's kind included."""
         return _rows(self.given)
 
-    def updated(self, changes: Mapping[str, Any]) -> "Recipe":
-        """This recipe with other values, None to take one away; entries without an effect beside the new ones are dropped.
+    @staticmethod
+    def term_text(term: str) -> str:
+        """Return a term of a condition with its option on the command line, for messages."""
+        key, _, word = term.partition("=")
+        if word:
+            return f"{key} = {word}" + (f" (--{word})" if key == "model.kind" else "")
+        return f"{key} ({SETTINGS[key].option})" if key in SETTINGS else key
 
-        So are the numbers of another kind of phantom, and the other description of a phantom's pose: a matrix replaces
-        position and angles, and both of these together a matrix.
+    def updated(self, changes: Mapping[str, Any]) -> "Recipe":
+        """Return this recipe with other values, None to remove one, and without those that have no effect any more.
+
+        The numbers of another kind of phantom are removed, too, and the other description of a phantom's pose: a matrix
+        replaces position and angles, and these two together replace a matrix.
         """
         values = {**self.given, **changes}
         stale: list[str] = []
         if (values.get("phantom.kind") or SETTINGS["phantom.kind"].default) != self["phantom.kind"]:
             stale += [key for key in values if key not in SETTINGS]
         if changes.get("phantom.matrix") is not None:
-            stale += _PLACED
-        elif any(key in changes for key in _PLACED) and all(key in values for key in _PLACED):
+            stale += _PLACEMENT
+        elif any(key in changes for key in _PLACEMENT) and all(key in values for key in _PLACEMENT):
             stale.append("phantom.matrix")
         return fitting_recipe({key: values[key] for key in values if key not in stale or key in changes}, changes)
 
     def fields(self, table: str, cls: Any) -> dict[str, Any]:
-        """Given values of a table that are arguments of the dataclass `cls`, by their names."""
+        """Return the given values of a table that are arguments of the dataclass `cls`, by the arguments' names."""
         keys = {f"{table}.{key}": name for key, name in setting_names(cls).items()}
         return {name: self.given[key] for key, name in keys.items() if key in self.given}
 
     def tables(self) -> dict[str, dict[str, Any]]:
-        """The values by table and name, as JSON and TOML hold them."""
+        """Return the given values by table and name, as JSON and TOML hold them."""
         tables: dict[str, dict[str, Any]] = {table: {} for table in TABLES}
         for key, value in self.given.items():
             table, _, name = key.partition(".")
@@ -102,12 +75,15 @@ class Recipe(Values):
         return {table: values for table, values in tables.items() if values}
 
 
-def fitting_recipe(values: Mapping[str, Any], kept: Collection[str] = ()) -> Recipe:
-    """The recipe of those values, None aside, that have an effect; `InputError` where one of `kept` has none."""
-    values = _with_hole({key: value for key, value in values.items() if value is not None}, kept)
+def fitting_recipe(values: Mapping[str, Any], required: Collection[str] = ()) -> Recipe:
+    """Return the recipe of those `values` that are not None and have an effect.
+
+    Raises `InputError` if a value whose key is in `required` has none.
+    """
+    values = _with_hole({key: value for key, value in values.items() if value is not None}, required)
     while True:
         rows = _rows(values)
-        stale = [key for key in values if key not in kept and (key not in rows or _unmet(values, key, rows))]
+        stale = [key for key in values if key not in required and (key not in rows or unmet_needs(values, key, rows))]
         if not stale:
             return Recipe(values)
         for key in stale:
@@ -115,41 +91,41 @@ def fitting_recipe(values: Mapping[str, Any], kept: Collection[str] = ()) -> Rec
 
 
 def recorded_recipe(recipe: Recipe) -> Recipe:
-    """The recipe as a run keeps it: with this version's defaults of what the images depend on."""
-    of_images = ("model.", "detector.", "compute.")
-    defaults = {key: setting.default for key, setting in SETTINGS.items() if key.startswith(of_images)}
+    """Return the recipe as a run keeps it: with this version's defaults of all settings that its images depend on."""
+    tables = ("model.", "detector.", "compute.")
+    defaults = {key: setting.default for key, setting in SETTINGS.items() if key.startswith(tables)}
     return fitting_recipe({**defaults, **recipe.given}, recipe.given)
 
 
-def recipe_of_tables(tables: Mapping[str, Any], recorded: bool = False) -> Recipe:
-    """The recipe of values by table and name, as `Recipe.tables` gives them, without defaults that have no effect.
+def recipe_from_tables(tables: Mapping[str, Any], recorded: bool = False) -> Recipe:
+    """Return the recipe of values by table and name, as `Recipe.tables` gives them, without defaults that have no effect.
 
-    With `recorded` it is one of a run: earlier versions wrote numbers of rays that had no effect, and these go, too.
-    `InputError` as for `Recipe`.
+    `recorded` says that the tables are those of a run. Earlier versions recorded numbers of rays that had no effect; these
+    are removed, too. Errors are those of `Recipe`.
     """
     values: dict[str, Any] = {}
     for table, entries in tables.items():
         if table not in TABLES or not isinstance(entries, Mapping):
             raise InputError(f"{table}: expected one of the tables {', '.join(f'[{name}]' for name in TABLES)}")
         values |= {f"{table}.{name}": value for name, value in entries.items()}
-    # Versions record defaults that have no effect in later ones.
-    dropped = SAMPLING if recorded else ()
-    given = [k for k, v in values.items() if k not in SETTINGS or (v != SETTINGS[k].default and k not in dropped)]
-    return fitting_recipe(values, given)
+    # A recorded default may have no effect in a later version, so it is not required to have one.
+    optional = SAMPLING if recorded else ()
+    required = [k for k, v in values.items() if k not in SETTINGS or (v != SETTINGS[k].default and k not in optional)]
+    return fitting_recipe(values, required)
 
 
 def read_recipe(path: AnyPath) -> Recipe:
-    """The recipe in a TOML file, whose paths are relative to its folder; `InputError` names file and key."""
+    """Return the recipe of a TOML file, whose paths are relative to its folder; `InputError` names file and key."""
     folder = Path(path).parent
     tables = read_toml(path)
     with naming(path):
-        return _with_paths(recipe_of_tables(tables), lambda name: os.path.normpath(folder / name))
+        return _with_paths(recipe_from_tables(tables), lambda name: os.path.normpath(folder / name))
 
 
 def write_recipe(recipe: Recipe, path: AnyPath) -> None:
-    """Write a recipe as TOML: what is given, and every other setting as a comment with its default.
+    """Write a recipe as TOML: the given values, and every other setting as a comment with its default.
 
-    `InputError` where the name does not end in .toml, or the file cannot be written.
+    Raises `InputError` if the name does not end in .toml, or the file cannot be written.
     """
     path = Path(path)
     require_ending(path, (".toml",))
@@ -175,46 +151,24 @@ def write_recipe(recipe: Recipe, path: AnyPath) -> None:
     write_bytes(path, "\n".join([*lines, ""]).encode())
 
 
-def _with_hole(values: Mapping[str, Any], kept: Collection[str]) -> dict[str, Any]:
-    """The values, with hole "rays" for numbers of rays beside hole "auto", if they are `kept`, or beside none."""
-    given = {key for key in SAMPLING if values.get(key, SETTINGS[key].default) != SETTINGS[key].default}
-    numbers = given if "model.hole" not in values else given.intersection(kept)
-    is_free = values.get("model.kind") == "emission" and values.get("model.hole", "auto") == "auto"
-    return {**values, "model.hole": "rays"} if is_free and numbers else dict(values)
+def _with_hole(values: Mapping[str, Any], required: Collection[str]) -> dict[str, Any]:
+    """Return the values of a recipe of counts, with the hole "rays" if its numbers of rays ask for rays.
 
-
-def is_met(values: Mapping[str, Any], need: str, rows: Mapping[str, Setting] = SETTINGS) -> bool:
-    """Whether given values meet a condition of `Setting.needs`."""
-
-    def holds(term: str) -> bool:
-        key, _, word = term.partition("=")
-        if word and rows[key].names_file(values.get(key)):  # what its contents take is known when it is read
-            return True
-        return values.get(key, rows[key].default) == word if word else values.get(key) not in (None, False)
-
-    return any(map(holds, need.removeprefix("no ").split(" or "))) != need.startswith("no ")
-
-
-def _unmet(values: Mapping[str, Any], key: str, rows: Mapping[str, Setting]) -> list[str]:
-    """The conditions that keep a setting from having an effect beside the others."""
-    return [need for need in rows[key].needs if not is_met(values, need, rows)]
-
-
-def _named(term: str) -> str:
-    """A setting, or one with a value, for messages: with its option."""
-    key, _, word = term.partition("=")
-    if word:
-        return f"{key} = {word}" + (f" (--{word})" if key == "model.kind" else "")
-    return f"{key} ({SETTINGS[key].option})" if key in SETTINGS else key
+    They do so if no hole is given; beside the hole "auto", only if they are `required`.
+    """
+    changed = {key for key in SAMPLING if values.get(key, SETTINGS[key].default) != SETTINGS[key].default}
+    numbers = changed if "model.hole" not in values else changed.intersection(required)
+    is_automatic = values.get("model.kind") == "emission" and values.get("model.hole", "auto") == "auto"
+    return {**values, "model.hole": "rays"} if is_automatic and numbers else dict(values)
 
 
 def _rows(values: Mapping[str, Any]) -> Mapping[str, Setting]:
-    """All settings, with those of the phantom's kind."""
+    """Return all settings by their keys, with those of the kind of phantom in `values`."""
     return settings_with(str(values.get("phantom.kind", SETTINGS["phantom.kind"].default)))
 
 
 def _with_paths(recipe: Recipe, change: Callable[[str], str]) -> Recipe:
-    """The recipe with every file's name changed by a function."""
+    """Return the recipe with every file's name changed by a function."""
     changed = {}
     for key, value in recipe.given.items():
         if key in SETTINGS and SETTINGS[key].names_file(value):

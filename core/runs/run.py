@@ -1,4 +1,4 @@
-"""A projection run: the images, and everything they were made from."""
+"""Projection run: the images, and everything that they were made from."""
 
 import contextlib
 import platform
@@ -17,40 +17,52 @@ from ..models.model import checked_background
 from ..validation import freeze, real_numbers
 from ..version import VERSION
 from ..volumes.volume import Volume
-from .recipe import Recipe, recipe_of_tables
+from .recipe import Recipe, recipe_from_tables
 
 
 def versions() -> dict[str, str]:
-    """Versions of mphDRR, Python and what the numbers depend on; "cpu" is the level of the compiled kernels."""
-    found = {"mphdrr": VERSION, "python": platform.python_version(), "numpy": np.__version__}
+    """Return the versions of mphDRR, Python, NumPy and torch, and as "cpu" the level of the compiled kernels."""
+    numbers = {"mphdrr": VERSION, "python": platform.python_version(), "numpy": np.__version__}
     with contextlib.suppress(metadata.PackageNotFoundError):
-        found["torch"] = metadata.version("torch")
-    with contextlib.suppress(ImportError, OSError):  # there is none for this platform
+        numbers["torch"] = metadata.version("torch")
+    with contextlib.suppress(ImportError, OSError):  # this platform may have no compiled kernels
         from ..rays.backends import cpu
 
-        found["cpu"] = cpu.levels()[cpu.level]
-    return found
+        numbers["cpu"] = cpu.levels()[cpu.level]
+    return numbers
 
 
 @dataclass(frozen=True, eq=False)
 class ProjectionRun:
-    """The images of one run, with geometry, volume and provenance; `InputError` where the parts do not fit together.
+    """Images of one run with their geometry, volume and provenance; raises `InputError` if these do not fit together.
 
-    A measured run (`counts_run`) has no volume: nobody knows what was in the scanner.
+    A measured run (`counts_run`) has no volume: the activity in the scanner is unknown.
     """
 
-    projections: Floats32  # (M, n_v, n_u), column index along +u, row index along +v
-    system: Scanner  # the M modules
-    views: Views  # the M images' rays
-    volume: Volume | None = None  # what was projected; None where the images were measured
-    unit: str = ""  # of the projections, such as "kBq/mL mm"
-    settings: Mapping[str, Any] = field(default_factory=dict)  # how they were made: anything JSON can hold
-    seed: int | None = None  # of the noise; None where the projections have none
-    workbook: str = ""  # name of the geometry workbook, and its SHA-256; empty where there is none
+    projections: Floats32
+    """Images (M, n_v, n_u): column index along +u, row index along +v."""
+    system: Scanner
+    """Scanner with the M modules."""
+    views: Views
+    """Rays of the M images."""
+    volume: Volume | None = None
+    """Volume that was projected; None for measured images."""
+    unit: str = ""
+    """Unit of the projections, such as "kBq/mL mm"."""
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    """Record of how the images were made, with values that JSON can hold."""
+    seed: int | None = None
+    """Seed of the noise; None for images without drawn noise."""
+    workbook: str = ""
+    """Name of the geometry workbook's file; empty for a scanner without a workbook."""
     workbook_sha256: str = ""
-    versions: Mapping[str, str] = field(default_factory=versions)  # of mphDRR and what it ran on
-    background: float | Floats = 0.0  # besides the volume, as in `Emission`: (), (M,) or images
-    efficiency: float | Floats = 1.0  # of the pixels, in the same forms
+    """SHA-256 of the workbook's file, hexadecimal."""
+    versions: Mapping[str, str] = field(default_factory=versions)
+    """Versions of mphDRR and of the programs that it ran on."""
+    background: float | Floats = 0.0
+    """Expected counts besides the volume's: one number, one for each module (M,), or images (M, n_v, n_u)."""
+    efficiency: float | Floats = 1.0
+    """Detection efficiency of the pixels, in one of the same forms."""
 
     def __post_init__(self) -> None:
         self.views.require_pinholes("run")
@@ -61,8 +73,8 @@ class ProjectionRun:
         projections = checked(real_numbers(self.projections, name), name, shape, False)
         object.__setattr__(self, "projections", freeze(projections.view()))
         for form in ("background", "efficiency"):
-            found = checked_background(getattr(self, form), f"run: {form}", len(self.views), self.views.shape)
-            object.__setattr__(self, form, found)
+            values = checked_background(getattr(self, form), f"run: {form}", len(self.views), self.views.shape)
+            object.__setattr__(self, form, values)
         if not self.unit:
             if self.volume is None:
                 raise InputError("run: without a volume, say the unit of the projections, such as counts")
@@ -74,18 +86,18 @@ class ProjectionRun:
 
     @property
     def is_measured(self) -> bool:
-        """Whether the images are counts of a real or another simulator's scanner."""
+        """Whether the images are counts that a real scanner, or another simulator, has recorded."""
         return "frames" in self.settings
 
     @property
     def recipe(self) -> Recipe:
-        """What was asked for; `InputError` where the run holds no recipe, as those of version 0.1.0."""
+        """Recipe of the run; `InputError` is raised for a run without one, such as those of version 0.1.0."""
         if "recipe" not in self.settings:
             raise InputError("the run holds no recipe: give its model, as by --set model.kind=emission or --recipe")
-        return recipe_of_tables(self.settings["recipe"], recorded=True)
+        return recipe_from_tables(self.settings["recipe"], recorded=True)
 
     def intrinsics(self) -> Floats:
-        """Camera matrices K (M, 3, 3), pixels: ``K @ (x_u, x_v, x_k)`` is a multiple of ``(column, row, 1)``.
+        """Return the camera matrices K (M, 3, 3), pixels: ``K @ (x_u, x_v, x_k)`` is a multiple of ``(column, row, 1)``.
 
         (x_u, x_v, x_k) is a point in the module's frame, mm from the pinhole.
         """

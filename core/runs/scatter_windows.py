@@ -1,4 +1,4 @@
-"""Scatter in measured counts, found from frames of energy windows beside the peak's."""
+"""Scatter in measured counts, estimated from frames of energy windows beside the photopeak's window."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -18,20 +18,20 @@ _WORDS = ("lower", "peak", "upper")
 
 @dataclass(frozen=True)
 class ScatterWindows:
-    """Frames of energy windows beside the peak's, from which `energy_window_scatter` estimates the scatter in it.
+    """Frames of energy windows beside the photopeak's, from which `energy_window_scatter` estimates its scatter.
 
     Attributes
     ----------
     lower_frames, upper_frames
-        Which module each frame is of, as `frames` of `counts_run`; None: there is no such window, and the continuum falls
-        to 0 there.
+        Modules of the frames in the lower and the upper window, as `frames` of `counts_run`. None for no such window: the
+        continuum then falls to 0 there.
     widths
-        Widths of the lower, the peak and the upper window, keV. None: what the files say.
+        Widths of the lower, the peak and the upper window, keV. None for the widths in the files.
     fwhm
-        FWHM in pixels of the Gaussian that smooths the estimate. None: it is not smoothed.
+        FWHM, pixels, of the Gaussian that smooths the estimate. None for no smoothing.
     isotope, energy_fwhm
-        With both, the photopeak's tails in the outer windows are no scatter: the FWHM of the energy resolution is that of
-        `Emission`. The files must say the windows' energies. None: all that is in the outer windows is scatter.
+        Isotope, and FWHM of the energy resolution as in `Emission`: with both, the photopeak's tails in the outer windows
+        are not counted as scatter, and the files must state the windows' energies. None: all counts there are scatter.
     """
 
     lower_frames: str | Sequence[int | None] | None = None
@@ -50,9 +50,9 @@ class ScatterWindows:
 
     @property
     def frames(self) -> dict[str, Any]:
-        """Which module each frame is of, by the windows "lower" and "upper" that there are."""
-        given = {"lower": self.lower_frames, "upper": self.upper_frames}
-        return {word: frames for word, frames in given.items() if frames is not None}
+        """Modules of the frames by window, "lower" and "upper"; a missing window has no entry."""
+        frames = {"lower": self.lower_frames, "upper": self.upper_frames}
+        return {word: modules for word, modules in frames.items() if modules is not None}
 
     def estimate(
         self,
@@ -61,13 +61,23 @@ class ScatterWindows:
         found: Counts,
         efficiency: float | Floats = 1.0,
     ) -> tuple[Floats, dict[str, Any]]:
-        """The scatter (M, n_v, n_u) in the images of the window "peak", and what is recorded of it.
+        """Return the scatter (M, n_v, n_u) in the images of the peak window, and its record.
 
-        `images` and the frames `used` for them, in the modules' order, are by the windows "peak", "lower" and "upper"; the
-        `efficiency` is that of the images.
-        `InputError` where the files say other windows or exposures, or nothing says the windows' widths.
+        Parameters
+        ----------
+        images, used
+            Images (M, n_v, n_u), and the indices of their frames in `found`, by the windows "peak", "lower" and "upper".
+        found
+            Frames of the files, with the energies and exposures that the files state.
+        efficiency
+            Detection efficiency of the images.
+
+        Raises
+        ------
+        InputError
+            The files state other windows or exposures, or the windows' widths are unknown.
         """
-        _require_own_frames(used, found)
+        _require_frames_of_windows(used, found)
         widths = [None if word not in used else self._width(word, used[word], found) for word in _WORDS]
         (lower, peak, upper) = map(images.get, _WORDS)
         assert peak is not None
@@ -76,49 +86,49 @@ class ScatterWindows:
             edges = [None if word not in used else self._edges(word, used[word], found) for word in _WORDS]
             shares = peak_shares(isotope(self.isotope), edges, self.energy_fwhm)
         scatter, _ = energy_window_scatter(lower, peak, upper, widths, self.fwhm, with_image_axes(efficiency), shares)
-        scatter = scatter.clip(min=0)  # a background cannot be less
-        beside = sum(images[word].sum(axis=(1, 2), dtype=float) for word in self.frames)
+        scatter = scatter.clip(min=0)  # a background cannot be negative
+        window_counts = sum(images[word].sum(axis=(1, 2), dtype=float) for word in self.frames)
         record = {"windows": sorted(self.frames), "widths_keV": widths, "fwhm_pixels": self.fwhm}
         record |= {} if shares is None else {"shares_of_peak": list(shares)}
-        return scatter, record | {"counts": np.asarray(beside).tolist()}
+        return scatter, record | {"counts": np.asarray(window_counts).tolist()}
 
     @staticmethod
-    def _edges(word: str, used: Sequence[int], found: Counts) -> tuple[float, float]:
-        """The energies between which the frames of a window are, keV."""
-        low, high = found.about[used[0], -2:].tolist()
-        if not (np.isfinite(low + high) and (found.about[used, -2:] == found.about[used[0], -2:]).all()):
-            needed = f"the {word} window's energies, the same of all frames"
-            raise InputError(f"{found.name}: the peak's tails need {needed}")
+    def _edges(word: str, used: Sequence[int], counts: Counts) -> tuple[float, float]:
+        """Return the lowest and the highest energy, keV, of a window, which its frames must have in common."""
+        low, high = counts.about[used[0], -2:].tolist()
+        if not (np.isfinite(low + high) and (counts.about[used, -2:] == counts.about[used[0], -2:]).all()):
+            expected = f"the {word} window's energies, the same of all frames"
+            raise InputError(f"{counts.name}: the peak's tails need {expected}")
         return low, high
 
-    def _width(self, word: str, used: Sequence[int], found: Counts) -> float:
-        """The width of a window, keV: what is given, unless a file contradicts it, or what the files say."""
-        given = None if self.widths is None else float(self.widths[_WORDS.index(word)])
-        said = {round(high - low, 3) for low, high in found.about[used, -2:] if np.isfinite(low + high)}
-        widths = " and ".join(f"{width:g}" for width in sorted(said))
-        text = f"{found.name}: the file says a {word} window of {widths} keV"
-        if len(said) > 1:
+    def _width(self, word: str, used: Sequence[int], counts: Counts) -> float:
+        """Return the width of a window, keV, from `widths`, which must agree with the files, or from the files."""
+        width = None if self.widths is None else float(self.widths[_WORDS.index(word)])
+        file_widths = {round(high - low, 3) for low, high in counts.about[used, -2:] if np.isfinite(low + high)}
+        widths = " and ".join(f"{value:g}" for value in sorted(file_widths))
+        text = f"{counts.name}: the file says a {word} window of {widths} keV"
+        if len(file_widths) > 1:
             raise InputError(f"{text}; expected frames of one width")
-        if given is None and not said:
+        if width is None and not file_widths:
             advice = "say it (--window-widths LOWER PEAK UPPER)"
-            raise InputError(f"{found.name}: it does not say how wide the energy windows are; {advice}")
-        if given is None:
-            return said.pop()
-        if any(differs(width, given) for width in said):
-            raise InputError(f"{text}, not {given:g} (--window-widths)")
-        return given
+            raise InputError(f"{counts.name}: it does not say how wide the energy windows are; {advice}")
+        if width is None:
+            return file_widths.pop()
+        if any(differs(value, width) for value in file_widths):
+            raise InputError(f"{text}, not {width:g} (--window-widths)")
+        return width
 
 
-def _require_own_frames(used: Mapping[str, Sequence[int]], found: Counts) -> None:
-    """Refuse frames that are of two windows, of windows on the wrong side of the peak's, or of another exposure."""
+def _require_frames_of_windows(used: Mapping[str, Sequence[int]], counts: Counts) -> None:
+    """Raise `InputError` for frames in two windows, at energies on the wrong side of the peak, or of another exposure."""
     for word, side in (("lower", -1), ("upper", 1)):
-        for k, other in zip(used["peak"], used.get(word, ()), strict=False):
-            where = f"{word}_frames (--{word}-frames): frame {other + 1}"
-            if other in used["peak"] or (word == "upper" and other in used.get("lower", ())):
-                raise InputError(f"{where} is of another window, too")
-            mine, its = found.about[k, -2:].mean(), found.about[other, -2:].mean()
-            if side * (its - mine) < 0:
-                raise InputError(f"{where} is of energies around {its:g} keV, the peak's around {mine:g} keV")
-            if differs(found.about[other, 0], found.about[k, 0]):
-                times = f"{found.about[other, 0]:g} s, the peak's {found.about[k, 0]:g} s"
-                raise InputError(f"{where}: the file says an exposure of {times}; expected the same")
+        for peak_frame, window_frame in zip(used["peak"], used.get(word, ()), strict=False):
+            place = f"{word}_frames (--{word}-frames): frame {window_frame + 1}"
+            if window_frame in used["peak"] or (word == "upper" and window_frame in used.get("lower", ())):
+                raise InputError(f"{place} is of another window, too")
+            peak_energy, energy = counts.about[peak_frame, -2:].mean(), counts.about[window_frame, -2:].mean()
+            if side * (energy - peak_energy) < 0:
+                raise InputError(f"{place} is of energies around {energy:g} keV, the peak's around {peak_energy:g} keV")
+            if differs(counts.about[window_frame, 0], counts.about[peak_frame, 0]):
+                times = f"{counts.about[window_frame, 0]:g} s, the peak's {counts.about[peak_frame, 0]:g} s"
+                raise InputError(f"{place}: the file says an exposure of {times}; expected the same")

@@ -1,4 +1,4 @@
-"""The settings of a projection run, declared once.
+"""Settings of a projection run, declared once.
 
 `SETTINGS` is the only declaration: the options of ``mphdrr project``, the recipe files, the properties of Blender's panel
 and operator, and the record in a run file follow from it. A new setting of a model is a line here and an argument of the
@@ -7,168 +7,35 @@ same name in the model's class.
 
 import dataclasses
 import functools
-import operator
-from collections.abc import Collection, Iterable, Mapping
-from contextlib import suppress
-from inspect import Parameter
-from numbers import Integral, Real
-from pathlib import Path
+from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Any
 
-from ..errors import InputError
-from ..phantoms.kinds import KINDS, PhantomKind
+from ..phantoms.kinds import KINDS
 from ..phantoms.settings import setting_names
 from ..physics.isotopes import ISOTOPES
 from ..physics.materials import APERTURES, CRYSTALS
+from ..physics.noise import NOISE_MODELS
 from ..rays.backends import BACKENDS, OLD_NAMES
-from ..reconstruction.methods import METHOD_FILES, METHODS, PRIORS
-from ..validation import real_array
+from ..recipes.settings import (
+    Setting,
+    UncheckedSetting,
+    alternatives,
+    choice_setting,
+    default_setting,
+    table_names,
+    word_labels,
+)
+from ..reconstruction.method_files import METHOD_FILES
+from ..reconstruction.methods import METHODS, argument_settings
 from ..volumes.volume import LINE_INTEGRALS
 from .frame_files import RAW_TYPES
 from .orientations import ORIENTATIONS
 
-Words = Mapping[str, tuple[str, str]]
-"""The words that a setting may be, each with its label and description."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Setting:
-    """One setting of a run.
-
-    Its `needs` are conditions without which it has no effect, each alternatives such as ``"model.aperture_mu or
-    model.within_cone"``: a setting that must be given, have one value (``key=value``; a file's name may mean it), or not be
-    given (``no key``).
-    """
-
-    key: str  # table and name: "model.time"
-    kind: type  # of its value, or of each of several: bool, int, float, str; list for a 4 x 4 matrix
-    default: Any  # None: none
-    text: str  # what it is, for help texts
-    absent: str = ""  # what it means that none is given, where the default is None
-    unit: str = ""  # such as "mm"
-    words: Words = dataclasses.field(default_factory=dict)  # that it may be, beside numbers if its kind is a number
-    least: float | None = None
-    above: float | None = None  # it must exceed this
-    most: float | None = None
-    slider: float | None = None  # the largest value that a slider reaches
-    sizes: tuple[int, ...] | None = None  # how many values it may have, () for any number; None: one value alone
-    of_modules: bool = False  # whether it may be a list, or a text such as "10, 20", of one for each module
-    is_path: bool = False  # whether it names a file
-    endings: Collection[str] = ()  # in lower case, of files that it may name beside its words
-    needs: tuple[str, ...] = ()
-    option: str = ""  # on the command line; by default made from the key, like the next
-    label: str = ""  # in Blender
-    unset: str = "Auto"  # what Blender's panels show of a number that is not given
-
-    def __post_init__(self) -> None:
-        name = self.key.rpartition(".")[2].removesuffix("_degrees")
-        object.__setattr__(self, "option", self.option or "--" + name.replace("_", "-"))
-        object.__setattr__(self, "label", self.label or name.replace("_", " ").title())
-
-    def names_file(self, value: Any) -> bool:
-        """Whether a value is a file's name."""
-        if self.of_modules and isinstance(value, tuple):
-            return False
-        return self.is_path or (isinstance(value, str) and Path(value).suffix.lower() in self.endings)
-
-    @property
-    def help(self) -> str:
-        """The text with unit, words and what leaving it out means."""
-        words = f"one of {', '.join(self.words)}" if self.words else ""
-        text = ", ".join(filter(None, (self.text, self.unit, words)))
-        return text + (f"; without it, {self.absent}" if self.absent else "")
-
-    @property
-    def expected(self) -> str:
-        """What one value must be, for messages."""
-        files = f"a file ({', '.join(self.endings)})" if self.endings else ""
-        words = " or ".join(filter(None, (f"one of {', '.join(self.words)}" if self.words else "", files)))
-        if self.kind in (bool, str):
-            return words or {bool: "true or false", str: "a text"}[self.kind]
-        number = "a whole number" if self.kind is int else "a number"
-        bounds = {"of {:g} or more": self.least, "above {:g}": self.above, "and at most {:g}": self.most}
-        number += "".join(" " + text.format(bound) for text, bound in bounds.items() if bound is not None)
-        return " or ".join(filter(None, (words, number + (f" ({self.unit})" if self.unit else ""))))
-
-    def checked(self, value: Any) -> Any:
-        """`value` as a recipe keeps it, lists as tuples; `InputError` where it is not what is expected."""
-        if self.kind is list:
-            return tuple(map(tuple, real_array(value, self.key, (4, 4)).tolist()))
-        if self.of_modules:
-            return self._of_modules(value)
-        if self.sizes is None:
-            return self._one(value)
-        values = value if isinstance(value, list | tuple) else [value]
-        if not values or (self.sizes and len(values) not in self.sizes):
-            count = " or ".join(map(str, self.sizes)) or "1 or more"
-            raise InputError(f"{self.key}: expected {count} values, got {len(values)}")
-        return tuple(map(self._one, values))
-
-    def _of_modules(self, value: Any) -> Any:
-        if isinstance(value, str) and not self.names_file(value):
-            with suppress(ValueError):
-                value = list(map(float, value.replace(",", " ").split()))
-        if not isinstance(value, list | tuple):
-            return self._one(value)
-        values = tuple(self._one(one) for one in value)
-        if not values or any(isinstance(one, str) for one in values):
-            raise InputError(f"{self.key}: expected {self.expected}, or a number for each module, got {value!r:.60}")
-        return values if len(values) > 1 else values[0]
-
-    def _one(self, value: Any) -> Any:
-        if isinstance(value, str):
-            if self.key == "compute.backend":
-                value = OLD_NAMES.get(value, value)
-            known = self.words or self.endings
-            good = value in self.words or self.names_file(value) if known else self.kind is str
-        elif self.kind in (bool, str):
-            good = isinstance(value, self.kind)
-        else:
-            bounds = ((self.least, operator.ge), (self.above, operator.gt), (self.most, operator.le))
-            good = isinstance(value, Integral if self.kind is int else Real) and not isinstance(value, bool)
-            good = good and abs(value) < 1e308 and all(b is None or holds(value, b) for b, holds in bounds)
-            value = self.kind(value) if good else value
-        if not good:
-            raise InputError(f"{self.key}: expected {self.expected}, got {value!r}")
-        return value
-
-
-@dataclasses.dataclass(frozen=True)
-class OwnSetting(Setting):
-    """A setting of one kind of phantoms, whose class checks its values."""
-
-    def checked(self, value: Any) -> Any:
-        """`value` as a recipe keeps it, lists as tuples."""
-        value = value.tolist() if hasattr(value, "tolist") else value
-        return tuple(value) if isinstance(value, list) else value
-
-
-def own_settings(kind: PhantomKind, row: type[Setting] = OwnSetting, **common: Any) -> list[Setting]:
-    """The settings of a kind of phantoms, as rows of a class; `common` is what all of them have."""
-    fields = {field.name: field for field in dataclasses.fields(kind.phantom)}
-    found = []
-    for key, name in setting_names(kind.phantom).items():
-        default: Any = kind.usual.get(name, fields[name].default)
-        one, sizes = (default[0], ()) if isinstance(default, tuple) else (default, None)
-        found.append(row(key, type(one), default, fields[name].metadata.get("text", ""), sizes=sizes, **common))
-    return found
-
-
-def named(names: Iterable[str], text: str = "") -> Words:
-    """Words that label themselves, described alike."""
-    return {name: (name[0].upper() + name[1:], text) for name in names}
-
-
-def _alternatives(key: str, words: Iterable[str]) -> str:
-    """The condition that a setting has one of these values."""
-    return " or ".join(f"{key}={word}" for word in words)
-
-
 _COUNTS = "model.kind=emission"
 _XRAYS = "model.kind=spectral"
 _PHOTONS = f"{_COUNTS} or {_XRAYS}"
-_METHOD_OF_COUNTS = _alternatives("reconstruction.method", [name for name, m in METHODS.items() if m.of_counts])
+_METHOD_OF_COUNTS = alternatives("reconstruction.method", [name for name, m in METHODS.items() if m.of_counts])
 _RAYS = "model.kind=transmission or model.hole=rays or model.hole=point"
 _FILE = "volume.file or volume.states"
 _MADE = "no counts.files"
@@ -178,46 +45,33 @@ _PHANTOM_NUMBER = (*_PHANTOM, "no phantom.file", "no phantom.text")
 _NO_PHANTOM = ("no phantom.kind", "no phantom.file", "no phantom.text")
 _SERIES = "The DICOM series with this number, description or UID, where the folder holds several"
 _AT_ENERGY = "Convert CT numbers to attenuation (1/mm) at this energy, or at an isotope's strongest line"
-_ISOTOPES = named(ISOTOPES, "Energy window 10 % around its strongest line")
+_ISOTOPES = word_labels(ISOTOPES, "Energy window 10 % around its strongest line")
 _BY_NAME = "As it attenuates the isotope's photons"
 
 
 _OF_MODULES = ", one number or one for each module that is used"
-
-
-def _argument(name: str, kind: type, text: str, absent: str = "", **more: Any) -> Setting:
-    """The setting of an argument of priors or methods, with their default, which has an effect where one takes it.
-
-    Where the defaults differ the setting has none, and its help lists them.
-    """
-    needs: list[str] = []
-    defaults: dict[str, Any] = {}
-    for key, choices in (("reconstruction.prior", PRIORS), ("reconstruction.method", METHODS)):
-        takers = {word: choice for word, choice in choices.items() if name in choice.own}
-        needs += [_alternatives(key, takers)] if takers else []
-        defaults |= {choice.label: choice.own[name] for choice in takers.values()}
-    known = set(defaults.values()) - {None, Parameter.empty}
-    if len(known) > 1:
-        absent += ": " + ", ".join(f"{label} {default:g}" for label, default in defaults.items())
-    default = known.pop() if len(known) == 1 else None
-    return Setting(f"reconstruction.{name}", kind, default, text, absent, needs=(" or ".join(needs),), **more)
+_ARGUMENTS = argument_settings((
+    *("background", "relaxation", "step_decay", "photons", "nonnegative"),
+    *("prior", "weight", "gamma", "edge", "anatomy"),
+))  # fmt: skip
+"""Settings of the arguments of methods and priors, in the order of panels and recipe files; new arguments follow."""
 
 
 _DECLARED = (
     Setting("system.file", str, None, "Geometry workbook (.xlsx, .xlsm)", is_path=True, option="--system"),
     Setting("system.kind", str, "pinhole", "Kind of the scanner, of a workbook that holds several", option="--scanner-kind"),
-    Setting("system.columns", str, None, "Column map (.toml): which cells hold what, where the headings do not say it; "
+    Setting("system.columns", str, None, "Column map (.toml): the meaning of cells whose headings do not say it; "
             "geometry show --write-columns makes a draft", is_path=True),
     Setting("system.modules", str, None, "Numbers of the modules, such as 1-40 or 1-20,41", "all"),
     Setting("volume.file", str, None, "Volume, or folder of a DICOM series", "a phantom is made", is_path=True,
             needs=("no volume.states", _MADE, *_NO_PHANTOM), option="--volume"),
-    Setting("volume.states", str, None, "Volumes of what changes, such as a beating heart: a run of each, as OUTPUT-1, "
-            "OUTPUT-2 …", is_path=True, sizes=(), needs=("no volume.file", _MADE, *_NO_PHANTOM)),
+    Setting("volume.states", str, None, "Volumes of the states of a changing body, such as a beating heart: a run of each, "
+            "as OUTPUT-1, OUTPUT-2 …", is_path=True, sizes=(), needs=("no volume.file", _MADE, *_NO_PHANTOM)),
     Setting("volume.object", str, None, "Name of the volume's object in a Blender scene", needs=_PHANTOM),
     Setting("volume.state", str, None, "State of the object's sequence", needs=("volume.object",)),
     Setting("volume.series", str, None, _SERIES, needs=("volume.file",)),
-    Setting("volume.quantity", str, None, "What the values of the volume are", "what the file says; a file that says "
-            "nothing holds activity for counts, mu for photons, else CT numbers", words=named(LINE_INTEGRALS, ""),
+    Setting("volume.quantity", str, None, "Quantity of the volume's values", "that of the file; a file that names none "
+            "holds activity for counts, mu for photons, else CT numbers", words=word_labels(LINE_INTEGRALS, ""),
             needs=(_FILE, "no volume.energy")),
     Setting("volume.energy", float, None, f"{_AT_ENERGY}; of spectral, at which the volume's mu holds", unit="keV",
             words=_ISOTOPES, above=0, needs=(f"{_FILE} or {_XRAYS}", "no model.kind=emission")),
@@ -229,7 +83,7 @@ _DECLARED = (
             needs=("no phantom.kind", "no phantom.text"), option="--phantom"),
     Setting("phantom.text", str, None, "A phantom's shapes: the contents of such a file",
             needs=("no phantom.kind", "no phantom.file"), option="--phantom-text"),
-    Setting("phantom.position", float, (0.0, 0.0, 0.0), "Middle of the phantom, x y z", unit="mm", sizes=(3,)),
+    Setting("phantom.position", float, (0.0, 0.0, 0.0), "Centre of the phantom, x y z", unit="mm", sizes=(3,)),
     Setting("phantom.euler_degrees", float, (0.0, 0.0, 0.0), "Angles phi theta psi: psi about its own axis, then theta "
             "about y, then phi about z", unit="degrees", sizes=(3,)),
     Setting("phantom.matrix", list, None, "World-from-phantom matrix, 4 rows", "that of position and angles", unit="mm"),
@@ -240,7 +94,7 @@ _DECLARED = (
     Setting("attenuation.file", str, None, "Attenuation coefficients, 1/mm, on any grid, or CT numbers (a DICOM folder, "
             "too); or a file of coefficients for each of the isotope's lines, by energy", "nothing attenuates", is_path=True,
             sizes=(), needs=(_COUNTS, "no attenuation.of_phantom"), option="--mu"),
-    Setting("attenuation.object", str, None, "Name of its object in a Blender scene",
+    Setting("attenuation.object", str, None, "Name of the attenuation's object in a Blender scene",
             needs=(_COUNTS, "no attenuation.file", "no attenuation.of_phantom"), option="--mu-object"),
     Setting("attenuation.series", str, None, _SERIES, needs=("attenuation.file",), option="--mu-series"),
     Setting("attenuation.energy", float, None, _AT_ENERGY + "; lines: for each of the isotope's lines at its own",
@@ -251,93 +105,94 @@ _DECLARED = (
     Setting("counts.files", str, None, "Measured counts instead of a volume: files with a frame a module, of a real or "
             "another simulator's scanner (.npy, .npz, .h5, DICOM, .mhd, Interfile's .hdr, raw numbers)", is_path=True,
             sizes=(), needs=(_COUNTS, "no volume.file", "no volume.states", *_NO_PHANTOM), option="--counts"),
-    Setting("counts.frames", str, None, "Which module each frame is of: the modules' numbers in the frames' order, such as "
-            "1-80, 80-1 or 3,1,2; none for one that is not used, none*80 for 80 of them", option="--frames",
+    Setting("counts.frames", str, None, "Numbers of the modules in the order of the frames, such as 1-80, 80-1 or 3,1,2; "
+            "none for an unused frame, none*80 for 80 of them", option="--frames",
             needs=("no counts.frames_file",)),
     Setting("counts.frames_file", str, None, "Text file with these numbers", is_path=True, needs=("no counts.frames",)),
-    Setting("counts.orientation", str, None, "How a frame, as a picture with row 0 at the top, lies on the crystal: seen "
-            "from the front (the pinhole) or from the back, with which of the module's axes at the top; one word, or one "
-            "for each frame", words=ORIENTATIONS, sizes=(), unset="Not Said"),
-    Setting("counts.expected", bool, False, "The numbers are expected means, which may be fractions",
+    Setting("counts.orientation", str, None, "Orientation of a frame, as a picture with row 0 at the top, on the crystal: "
+            "the side from which it is seen, front (the pinhole) or back, and the module's axis at the top; one word, or "
+            "one for each frame", words=ORIENTATIONS, sizes=(), unset="Not Said"),
+    Setting("counts.expected", bool, False, "The numbers are expected counts, which may be fractions",
             label="Expected Means"),
     Setting("counts.dataset", str, None, "Name of the array in .npz and .h5", "the only one of three axes",
             label="Array"),
     Setting("counts.raw_shape", int, None, "Frames, rows and columns of a raw file", least=1, sizes=(3,)),
     Setting("counts.raw_type", str, None, "Type of a raw file's numbers", "the file is not raw",
-            words=named(RAW_TYPES, ""), unset="Not Said"),
+            words=word_labels(RAW_TYPES, ""), unset="Not Said"),
     Setting("counts.raw_big_endian", bool, False, "The most significant byte of a raw file's numbers comes first",
             label="Big-Endian"),
     Setting("counts.lower_frames", str, None, "Frames of the energy window below the peak's, from which scatter is "
-            "estimated: which module each is of, as in frames", label="Lower Window"),
-    Setting("counts.upper_frames", str, None, "Frames of the energy window above the peak's, likewise",
+            "estimated: the modules' numbers, as in frames", label="Lower Window"),
+    Setting("counts.upper_frames", str, None, "Frames of the energy window above the peak's, as lower_frames",
             label="Upper Window"),
     Setting("counts.window_widths", float, None, "Widths of the lower, the peak and the upper energy window", "what the "
             "file says", unit="keV", above=0, sizes=(3,), needs=(_SCATTER,), label="Widths (keV)"),
     Setting("counts.scatter_fwhm", float, None, "FWHM of the Gaussian that smooths the estimate of scatter", "it is not "
             "smoothed", unit="pixels", above=0, needs=(_SCATTER,), label="Smoothing (pixels)"),
-    Setting("counts.scatter_tails", bool, False, "The photopeak's tails in those windows, by the energy resolution, are no "
-            "scatter", needs=(_SCATTER, "model.isotope", "model.energy_fwhm"), label="Peak's Tails"),
-    Setting("model.kind", str, "transmission", "What a pixel holds", label="Model", option="--model", words={
+    Setting("counts.scatter_tails", bool, False, "Subtract the photopeak's tails, computed from the energy resolution, from "
+            "the scatter windows", needs=(_SCATTER, "model.isotope", "model.energy_fwhm"), label="Peak's Tails"),
+    Setting("model.kind", str, "transmission", "Model of the images", label="Model", option="--model", words={
         "transmission": ("Radiograph", "Line integrals of the volume"),
-        "emission": ("SPECT Counts", "Photons of a volume of activity that the crystal counts"),
-        "spectral": ("X-ray Counts", "Photons of an X-ray system's tubes that its panels count, or their signal: all "
-                     "energies, by kVp, mAs and filters"),
-        "inverse-square": ("Inverse Square Sum", "Line integrals with each segment times a point source's sensitivity, "
-                           "as 1/h^2: no counts, for comparison"),
+        "emission": ("SPECT Counts", "Expected counts of the photons that a volume of activity emits"),
+        "spectral": ("X-ray Counts", "Photons from the tubes of an X-ray system, or the panels' signal, over all energies, "
+                     "by kVp, mAs and filters"),
+        "inverse-square": ("Inverse Square Sum", "Line integrals weighted with the sensitivity to a point source, as 1/h^2: "
+                           "no counts, for comparison"),
     }),
     Setting("model.time", float, 1.0, f"Acquisition time{_OF_MODULES}", unit="s", above=0, needs=(_COUNTS,
             "no frames.times"), label="Time (s)", of_modules=True),
     Setting("model.start", float, 0.0, f"Start of the acquisition after the reference time of the activity{_OF_MODULES}",
             unit="s", needs=(_COUNTS, "no frames.starts"), label="Start (s)", option="--start-time", of_modules=True),
     Setting("model.photons", float, None, "X-ray photons per pixel: a radiograph of attenuation coefficients then holds "
-            "those that pass", "line integrals", above=0, slider=1e6, needs=("model.kind=transmission",), unset="None"),
-    Setting("model.isotope", str, None, "What decays: its photons are counted, and its activity falls during the "
+            "the transmitted photons", "line integrals", above=0, slider=1e6, needs=("model.kind=transmission",),
+            unset="None"),
+    Setting("model.isotope", str, None, "Isotope, whose photons are counted and whose activity decays during the "
             "acquisition", "one photon per decay, and a constant activity", words=_ISOTOPES, needs=(_COUNTS,), unset="None"),
-    Setting("model.window", float, None, "Energies that are counted, from and to", "10 % around the isotope's strongest "
-            "line; of X rays, all", unit="keV", least=0, slider=1000, sizes=(2,), needs=(_PHOTONS,
+    Setting("model.window", float, None, "Energy window of the counted photons, from and to", "10 % around the "
+            "isotope's strongest line; of X rays, all", unit="keV", least=0, slider=1000, sizes=(2,), needs=(_PHOTONS,
             f"model.isotope or {_XRAYS}", "no model.panel=energy"), label="Window (keV)"),
-    Setting("model.panel", str, "counting", "What panels make of X rays", words={
-        "counting": ("Counts Photons", "Those of an energy window"),
-        "energy": ("Integrates Energy", "The energy, keV, that it absorbs"),
+    Setting("model.panel", str, "counting", "Signal of the X-ray panels", words={
+        "counting": ("Counts Photons", "Number of photons in an energy window"),
+        "energy": ("Integrates Energy", "Absorbed energy, keV"),
     }, needs=(_XRAYS,)),
     Setting("model.sensor", str, None, "Material of the panel that stops the X rays", "all are stopped",
-            words=named(("CdTe", "CZT", "silicon", "CsI")), needs=(_XRAYS,), unset="None"),
-    Setting("model.sensor_thickness", float, 2.0, "Its thickness", unit="mm", above=0, slider=5, needs=(_XRAYS,
-            "model.sensor"), label="Sensor (mm)"),
+            words=word_labels(("CdTe", "CZT", "silicon", "CsI")), needs=(_XRAYS,), unset="None"),
+    Setting("model.sensor_thickness", float, 2.0, "Thickness of the panel's sensor", unit="mm", above=0, slider=5,
+            needs=(_XRAYS, "model.sensor"), label="Sensor (mm)"),
     Setting("model.sensor_fwhm", float, 0.0, "FWHM of a panel's energy resolution", unit="keV", least=0, slider=20,
             needs=(_XRAYS, "no model.panel=energy"), label="FWHM (keV)"),
-    Setting("model.materials", str, "water-bone", "What the volume consists of for X rays", words={
-        "water-bone": ("Water and Bone", "As CT numbers say: up to water's 0, then more and more bone"),
-        **named(("water", "bone", "PMMA", "iodine", "aluminum", "copper"), "At the density that the volume's mu says"),
+    Setting("model.materials", str, "water-bone", "Materials of the volume for X rays", words={
+        "water-bone": ("Water and Bone", "By CT number: water up to 0, then a growing share of bone"),
+        **word_labels(("water", "bone", "PMMA", "iodine", "aluminum", "copper"), "At the density that follows from mu"),
     }, needs=(_XRAYS,)),
     Setting("model.energy_fwhm", float, None, "FWHM of the detector's energy resolution at the window's line, as a share of "
-            "its energy: of each line, also beside the window, a part is counted", "all photons within the window",
+            "its energy: a part of each line is counted, also of lines outside the window", "all photons within the window",
             above=0, most=0.99, slider=0.3, needs=(_COUNTS, "model.isotope"), label="Energy FWHM"),
-    Setting("model.lines", str, "together", "How several lines of the isotope are computed", label="Lines", words={
+    Setting("model.lines", str, "together", "Treatment of several lines of the isotope", label="Lines", words={
         "together": ("Together", "As photons of one kind, with effective coefficients"),
         "apart": ("Apart", "Each with its own attenuation, penetration and absorption: takes their number times as long"),
     }, needs=(_COUNTS, "model.isotope")),
-    Setting("model.hole", str, "auto", "What photons pass: the whole hole (auto; depth, never by rays), points "
-            "of it (rays), or its middle alone (point)", label="Hole", option="--hole", words={
-        "auto": ("Automatic", "The depth-dependent pinhole response; rays where that cannot be"),
+    Setting("model.hole", str, "auto", "Model of the hole: the whole hole (auto; depth, never by rays), rays through "
+            "points of it (rays), or its centre alone (point)", label="Hole", option="--hole", words={
+        "auto": ("Automatic", "The depth-dependent pinhole response; rays where it is not available"),
         "depth": ("Depth-Dependent Response", "The depth-dependent pinhole response: the whole hole's blur, without rays"),
         "rays": ("Rays", "The blur of rays through points of the hole"),
-        "point": ("Point", "An ideal pinhole: rays through the middle of the hole, no blur"),
+        "point": ("Point", "An ideal pinhole: rays through the centre of the hole, no blur"),
     }, needs=(_COUNTS,)),
-    Setting("model.aperture_points", int, None, "Points of the hole that rays pass; 1: its middle, no blur, 7 and more: the "
-            "blur of a hole of this size", "as many as the hole's tolerance asks for", least=1, slider=64,
+    Setting("model.aperture_points", int, None, "Points of the hole that rays pass; 1: its centre, no blur, 7 and more: the "
+            "blur of a hole of this size", "as many as the hole's tolerance needs", least=1, slider=64,
             needs=(_COUNTS, "model.hole=rays", "no model.aperture_tolerance"), label="Hole Points"),
     Setting("model.aperture_tolerance", float, None, "In place of a number of points, as many as bring a voxel's image "
             "this close to that of the whole hole", "0.1, where rays are used", above=0, slider=1,
             needs=(_COUNTS, "model.hole=rays"), label="Hole Tolerance"),
     Setting("model.aperture_mu", float, None, "Material of the aperture's edge, or its attenuation coefficient at the "
-            "photons' energy", "nothing penetrates it", unit="1/mm", words=named(APERTURES, _BY_NAME), above=0,
+            "photons' energy", "nothing penetrates it", unit="1/mm", words=word_labels(APERTURES, _BY_NAME), above=0,
             slider=10, needs=(_COUNTS,), label="Aperture", unset="None"),
     Setting("model.opening_angle_degrees", float, 90.0, "Full angle of the knife edge's cone", unit="degrees", above=0,
             most=179.9, needs=(_COUNTS, "model.aperture_mu or model.within_cone")),
-    Setting("model.edge", str, "paix", "How photons penetrate the aperture's edge", label="Knife Edge", words={
+    Setting("model.edge", str, "paix", "Model of the penetration of the aperture's edge", label="Knife Edge", words={
         "paix": ("Effective Diameter", "As if the hole were wider (Paix 1967)"),
-        "path": ("Path Length", "Each by its path through the edge"),
+        "path": ("Path Length", "Each ray by its path length in the edge"),
     }, needs=(_COUNTS, "model.aperture_mu")),
     Setting("model.plate_thickness", float, None, "Thickness of the aperture's plate, in whose middle the edge is",
             "infinite", unit="mm", above=0, slider=20, needs=(_COUNTS, "model.edge=path"), label="Plate (mm)"),
@@ -345,7 +200,7 @@ _DECLARED = (
             "that pass them, or a neighbour's hole and walls, are counted", "nothing passes them", unit="mm", above=0,
             slider=20, needs=(_COUNTS, "model.aperture_mu"), label="Walls (mm)", unset="Opaque"),
     Setting("model.crystal_mu", float, None, "Material of the crystal that stops the photons, or its attenuation "
-            "coefficient at their energy", "all photons are counted", unit="1/mm", words=named(CRYSTALS, _BY_NAME),
+            "coefficient at their energy", "all photons are counted", unit="1/mm", words=word_labels(CRYSTALS, _BY_NAME),
             above=0, slider=5, needs=(_COUNTS,), label="Crystal", unset="None"),
     Setting("model.depth_layers", int, 1, "Depths in the crystal at which photons are recorded (parallax); 1: where they "
             "enter; without rays, more mean all depths", least=1, slider=8, needs=(_COUNTS, "model.crystal_mu")),
@@ -355,26 +210,26 @@ _DECLARED = (
             label="Knife-Edge Cone"),
     Setting("model.within_walls", bool, False, "The collimator's walls stop photons that would miss the crystal's front",
             needs=(_COUNTS,), label="Collimator Walls"),
-    Setting("model.within_crystal", bool, False, "Pixels beyond the crystal's side count nothing", needs=(_COUNTS,),
+    Setting("model.within_crystal", bool, False, "Pixels beyond the crystal's side detect nothing", needs=(_COUNTS,),
             label="Crystal's Side"),
-    Setting("model.background", float, 0.0, "Counts of each pixel besides those of the volume, in the whole acquisition: "
-            "scatter and dark counts", least=0, slider=100, needs=(_PHOTONS,), option="--background-counts"),
+    Setting("model.background", float, 0.0, "Expected counts of each pixel in the whole acquisition that do not come from "
+            "the volume: scatter and dark counts", least=0, slider=100, needs=(_PHOTONS,), option="--background-counts"),
     Setting("model.efficiency", float, 1.0, f"Factor of the counts of the volume{_OF_MODULES}, or a file with an image for "
             "each module, as counts flood writes it; 0: dead", least=0, slider=2, needs=(_COUNTS,), of_modules=True,
             endings=(".npy", ".npz", ".h5", ".hdf5")),
     Setting("model.dead_time", float, 0.0, "Time for which a module is busy after a photon", unit="µs", least=0, slider=20,
             needs=(_COUNTS,), label="Dead Time (µs)"),
-    Setting("model.dead_time_kind", str, "non-paralysable", "What photons do to a module that is busy", words={
-        "non-paralysable": ("Non-Paralysable", "Nothing: m = n / (1 + n dead time)"),
-        "paralysable": ("Paralysable", "They make it busy anew: m = n exp(-n dead time)"),
+    Setting("model.dead_time_kind", str, "non-paralysable", "Effect of photons on a module that is busy", words={
+        "non-paralysable": ("Non-Paralysable", "No effect: m = n / (1 + n dead time)"),
+        "paralysable": ("Paralysable", "A new dead time begins: m = n exp(-n dead time)"),
     }, needs=(_COUNTS, "model.dead_time")),
     Setting("model.pixel_points", int, None, "Points of each pixel's area, for each point of the hole; auto: as many as "
             "the tolerance asks for, which takes longer for small voxels", "auto for counts, 1, its centre, for "
             "radiographs", words={"auto": ("Automatic", "")}, least=1, slider=100, needs=(_RAYS,)),
     Setting("model.tolerance", float, 0.02, "Largest error of a single voxel's total in any module, as a share of it",
             above=0, slider=1, needs=(_RAYS,)),
-    Setting("detector.plane", str, "virtual", "Where the images are taken", label="Detector", option="--detector", words={
-        "virtual": ("Virtual", "Plane in front of the pinhole: upright, what the module's camera sees"),
+    Setting("detector.plane", str, "virtual", "Plane of the images", label="Detector", option="--detector", words={
+        "virtual": ("Virtual", "Plane in front of the pinhole: upright, as the module's camera sees it"),
         "real": ("Real", "Front face of the crystal behind the pinhole: point-inverted"),
     }),
     Setting("detector.columns", int, 256, "Pixel columns of each image", least=1, most=1 << 20, label="Pixels X",
@@ -388,31 +243,31 @@ _DECLARED = (
     Setting("frames.times", float, None, "Durations of a scan's frames, or of a heart's gates: a run of each, as OUTPUT-1, "
             "OUTPUT-2 …, of the volume, or of each its state", "there is one frame", unit="s", above=0, sizes=(),
             needs=(_COUNTS, _MADE), option="--frame-times", label="Frame Times (s)"),
-    Setting("frames.starts", float, None, "When they start after the reference time of the activity; of gates, all with the "
-            "scan", "each as the one before ends", unit="s", sizes=(), needs=("frames.times",), option="--frame-starts",
-            label="Frame Starts (s)"),
+    Setting("frames.starts", float, None, "Starts of the frames after the reference time of the activity; gates all start "
+            "with the scan", "each starts as the previous one ends", unit="s", sizes=(), needs=("frames.times",),
+            option="--frame-starts", label="Frame Starts (s)"),
     Setting("frames.bins", float, None, "Energy bins of X rays, from, to, from, to …: a run of each, as OUTPUT-1, "
             "OUTPUT-2 …", "one, the window", unit="keV", least=0, sizes=(), option="--bins",
             needs=(_XRAYS, "no model.panel=energy", "no model.window", "no volume.states")),
     Setting("noise.seed", int, None, "Draw Poisson counts with this seed; of several states or frames with SEED, SEED + 1 …",
             "their expected means", least=0, most=2**64 - 1,
             needs=(f"model.photons or {_PHOTONS}", "no model.panel=energy", _MADE), option="--noise"),
-    Setting("reconstruction.method", str, "osem", "How the volume is found", endings=METHOD_FILES,
+    *choice_setting("noise.model", NOISE_MODELS, "How counts vary around their means", option="--noise-model",
+                    needs=("noise.seed",)),
+    Setting("reconstruction.method", str, "osem", "Reconstruction method", endings=METHOD_FILES,
             words={name: (method.label, method.text) for name, method in METHODS.items()}),
-    _argument("iterations", int, "How often all images are used", "what suits the method", least=1, slider=100),
-    _argument("subsets", int, "Of the modules: each of an iteration's updates uses one of them",
-              "about a fifth of the modules' number", least=1, slider=80),
+    *(_ARGUMENTS.pop(name) for name in ("iterations", "subsets")),
     Setting("reconstruction.voxels", int, None, "Voxels along x y z, or one number for all",
             "voxels are of half the smallest rod, or of half the resolution, if 64 to 128 of them cover the ROI",
             least=1, sizes=(1, 3)),
     Setting("reconstruction.spacing", float, None, "Voxel size, one or three", "the voxels cover the ROI", unit="mm",
             above=0, slider=10, sizes=(1, 3), label="Voxel Size (mm)"),
-    Setting("reconstruction.center", float, (0.0, 0.0, 0.0), "Middle of the volume, x y z", unit="mm", sizes=(3,)),
-    Setting("reconstruction.allow", str, None, "What may differ from what a network was trained for",
-            words=named(("scanner", "grid", "physics")), sizes=(), needs=("reconstruction.method=FILE.pt",)),
-    Setting("reconstruction.hole", str, "auto", "How the hole's blur is modelled: auto is by depth, where the run's "
+    Setting("reconstruction.center", float, (0.0, 0.0, 0.0), "Centre of the volume, x y z", unit="mm", sizes=(3,)),
+    Setting("reconstruction.allow", str, None, "Conditions that may differ from those of a network's training",
+            words=word_labels(("scanner", "grid", "physics")), sizes=(), needs=("reconstruction.method=FILE.pt",)),
+    Setting("reconstruction.hole", str, "auto", "Model of the hole's blur: auto is by depth, if the run's "
             "model allows it and no points are given", label="Hole's Blur", needs=(_METHOD_OF_COUNTS,), words={
-        "auto": ("Automatic", "By depth, where the run's model allows it and no points are given; else by rays"),
+        "auto": ("Automatic", "By depth, if the run's model allows it and no points are given; else by rays"),
         "depth": ("By Depth", "The whole hole, depth by depth: sharpest"),
         "rays": ("Rays", "Rays through some points of the hole: fast"),
     }),
@@ -425,59 +280,63 @@ _DECLARED = (
             needs=(_METHOD_OF_COUNTS,)),
     Setting("reconstruction.ignore_blur", bool, False, "Model no blur of the detector: no recovery of it",
             needs=(_METHOD_OF_COUNTS,), label="Ignore Detector Blur"),
-    Setting("reconstruction.ignore_beam_hardening", bool, False, "Take mere logarithms of X rays of many energies: no "
+    Setting("reconstruction.ignore_beam_hardening", bool, False, "Take the logarithms of polychromatic X rays without a "
             "correction for water", needs=(f"no {_METHOD_OF_COUNTS}",)),
-    _argument("background", float, "Counts expected in each pixel besides those of the volume, such as scatter", least=0,
-              slider=100),
-    _argument("relaxation", float, "Length of the steps, less than 2", above=0, slider=1.9),
-    _argument("step_decay", float, "Steps are 1 / (1 + this times the number of iterations before)", least=0, slider=1),
-    _argument("photons", float, "Of a pixel where nothing is between", "those of the run, or 1", above=0),
-    _argument("nonnegative", bool, "Values below 0 become 0"),
-    _argument("prior", str, "Penalty on noise", "none",
-              words={name: (prior.label, prior.text) for name, prior in PRIORS.items()}, unset="None"),
-    _argument("weight", float, "How much the penalty counts beside the data", above=0, slider=1),
-    _argument("gamma", float, "How much large differences are spared", least=0, slider=10),
-    _argument("edge", float, "Value below which differences count as noise", "what suits the penalty", above=0, slider=10),
-    _argument("anatomy", str, "Volume across whose edges differences are not penalised, such as a CT", is_path=True),
+    *_ARGUMENTS.values(),
     Setting("reconstruction.stop_change", float, None, "End when an iteration changes the objective by less than this share "
             "of it, such as 1e-5", "all iterations are done", above=0, slider=0.01),
     Setting("reconstruction.stop_noise", float, None, "End when the standard deviation in the region is this share of its "
             "mean", above=0, slider=1, needs=("reconstruction.stop_region",)),
-    Setting("reconstruction.stop_region", float, None, "Ball of even activity in which noise is measured: x y z radius",
+    Setting("reconstruction.stop_region", float, None, "Ball of uniform activity in which noise is measured: x y z radius",
             unit="mm", sizes=(4,), needs=("reconstruction.stop_noise",)),
-    Setting("reconstruction.stop_seconds", float, None, "End after so much time", unit="s", above=0, slider=3600),
-    Setting("compute.backend", str, "auto", "What computes the line integrals", words={
+    Setting("reconstruction.stop_seconds", float, None, "End after this time", unit="s", above=0, slider=3600),
+    Setting("compute.backend", str, "auto", "Backend that computes the line integrals", aliases=OLD_NAMES, words={
         "auto": ("Automatic", "The fastest that works here"), **{b.name: (b.label, b.text) for b in BACKENDS.values()},
     }),
     Setting("compute.threads", int, None, "Processor threads", "all", least=1, slider=64,
             needs=tuple(f"no compute.backend={b.name}" for b in BACKENDS.values() if b.own_threads)),
 )  # fmt: skip
 
-_NEEDED = {"phantom": _PHANTOM, "counts": ("counts.files",)}
-"""What all settings of a table need, but for that which is needed itself."""
+_TABLE_NEEDS = {"phantom": _PHANTOM, "counts": ("counts.files",)}
+"""Conditions of `Setting.needs` of all settings of a table, except those that a condition names."""
 
 
-def _with_needs(row: Setting) -> Setting:
-    """A setting that also needs what all of its table need."""
-    needed = _NEEDED.get(row.key.partition(".")[0], ())
-    return row if row.key in needed else dataclasses.replace(row, needs=(*needed, *row.needs))
+def _with_table_needs(row: Setting) -> Setting:
+    """Return a setting with the conditions of its table added to its own."""
+    needs = _TABLE_NEEDS.get(row.key.partition(".")[0], ())
+    return row if row.key in needs else dataclasses.replace(row, needs=(*needs, *row.needs))
 
 
-SETTINGS: Mapping[str, Setting] = MappingProxyType({row.key: _with_needs(row) for row in _DECLARED})
-"""Every setting by its key, table by table; `settings_with` has those of a kind of phantoms, too."""
+SETTINGS: Mapping[str, Setting] = MappingProxyType({row.key: _with_table_needs(row) for row in _DECLARED})
+"""Settings by their keys, table by table; `settings_with` adds the settings of a kind of phantom."""
+
+
+def phantom_settings(name: str, row: type[Setting] = UncheckedSetting, **details: Any) -> list[Setting]:
+    """Return the settings of the kind of phantom of that name, one for each field of its class, as rows of class `row`.
+
+    There are none for an unknown name. `details` are further attributes of all rows.
+    """
+    settings = []
+    for kind in KINDS:
+        fields = {field.name: field for field in dataclasses.fields(kind.phantom)} if kind.name == name else {}
+        for key, field in setting_names(kind.phantom).items() if fields else ():
+            default, text = kind.usual.get(field, fields[field].default), fields[field].metadata.get("text", "")
+            settings.append(default_setting(key, default, text, row, **details))
+    return settings
 
 
 @functools.cache
 def settings_with(kind: str) -> Mapping[str, Setting]:
-    """Every setting by its key, with those of a kind of phantoms."""
-    own = [row for known in KINDS if known.name == kind for row in own_settings(known, needs=_PHANTOM_NUMBER)]
-    return MappingProxyType({**SETTINGS, **{f"phantom.{row.key}": row for row in own}})
+    """Return every setting by its key, with those of a kind of phantom."""
+    rows = phantom_settings(kind, needs=_PHANTOM_NUMBER)
+    return MappingProxyType({**SETTINGS, **{f"phantom.{row.key}": row for row in rows}})
 
 
-TABLES = tuple(dict.fromkeys(key.partition(".")[0] for key in SETTINGS))
+TABLES = table_names(SETTINGS)
+"""Names of the tables of a recipe."""
 
 HOW_TABLES = ("reconstruction", "model", "attenuation", "compute")
-"""Those that say how a run is reconstructed. The others say how its images were made."""
+"""Tables of the settings of a run's reconstruction; the other tables have the settings of its images."""
 
 SAMPLING = tuple(f"model.{name}" for name in ("aperture_points", "aperture_tolerance", "pixel_points", "tolerance"))
-"""Numbers of rays and what sets them: counts have them only where the hole is by rays."""
+"""Keys of the numbers of rays and of their tolerances; counts have them only if the hole is modelled by rays."""

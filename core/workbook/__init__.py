@@ -9,8 +9,8 @@ columns are declared in `core.geometry.pinhole_columns`, or in the table of anot
   `draft` (meaning given by a person), `layout` (cells of each column), `reader`.
 - Writing: `writer`, `edit` (changed cells, and rows that move with the modules), `new_workbook`.
 
-To add a column, see docs/structure.md; a function for formulas is a line of a table in `formulas`, a word for a unit one in
-`headings`.
+To add a column, add a row to the table of `core.geometry.pinhole_columns`: nothing here. A function for formulas is a
+line of a table in `formulas`, a word for a unit one in `headings`; the styles of a new workbook are in new_workbook.txt.
 """
 
 from ..system_source import QuantityCells, SystemSource

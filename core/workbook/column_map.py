@@ -12,13 +12,13 @@ from ..errors import InputError
 from ..files import AnyPath, write_bytes
 from ..geometry.columns import ColumnTable
 from ..geometry.scanner import Scanner
+from ..recipes.toml import parse_toml, read_toml, toml_value
 from ..scanner_kinds import scanner_kind
-from ..toml import parse_toml, read_toml, toml_value
 from .headings import parse_unit
 from .sheet_xml import MAX_COLUMN, MAX_ROW
 
 RowMatching = Literal["by number", "in order", "one for all"]
-"""How the rows of a table are matched with the rows of the first table."""
+"""Rule by which the rows of a table are matched with the rows of the first table."""
 
 _HELP = "see docs/workbook.md"
 _KEYS = {"sheet": str, "header_row": int, "first_row": int, "last_row": int, "skip_rows": list}

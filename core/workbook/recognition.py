@@ -297,8 +297,8 @@ def _find_cell_doubts(table: HeadedTable, columns: list[tuple[int, str]]) -> Ite
         for row in table.rows:
             number_format = sheet.number_format(row, column)
             if not sheet.is_date(row, column) and not shows_as_stored(number_format, unit):
-                shown = f"{sheet.address(row, column)} is shown as {quote_text(number_format)}"
-                yield f"{shown}, where its heading says {unit or 'no unit'}: expected one unit"
+                appearance = f"{sheet.address(row, column)} is shown as {quote_text(number_format)}"
+                yield f"{appearance}, where its heading says {unit or 'no unit'}: expected one unit"
                 break
     for area in sheet.merged_areas:
         covered = [(row, c) for c, _ in columns for row in table.rows if area.contains(row, c)]

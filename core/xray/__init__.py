@@ -1,10 +1,16 @@
 """X rays: sources and panels as a kind of scanner, tube spectra, detectors, materials from counts; absorbed dose.
 
-Entry points: `XraySystem` (sources with panels; `xray_arc` and `xray_ring` build them), `SpectralScan` (images of a volume,
-the model "spectral" of recipes), `decompose` (materials from counts), `find_motion` (motion since a reference volume) and
-`absorbed_dose_rate` (dose of an activity).
+Entry points: `XraySystem` (sources with panels; `xray_arc` and `xray_ring` build them), `SpectralScan` (images of a
+volume, the model "spectral" of recipes), `decompose` (materials from counts), `find_motion` (motion since a reference
+volume) and `absorbed_dose_rate` (dose of an activity).
 
-To add a detector, write a class with a method ``response`` as in detectors.py and choose it in `SpectralScan._detector`. To
-add a column of the sheet X-ray, add a row to `XRAY_COLUMNS` in system.py. To add an isotope for dose, add a line to
-decays.txt. To add a mechanical check, add a `Finding` and its search to checks.py.
+- A detector is a class with a method ``response`` in detectors.py, its choice in `SpectralScan._detector` (scan.py) and
+  its word in ``model.panel`` of `core/runs/settings.py`. Counts of a run and their line integrals are made by
+  `SpectralScan`.
+- A column of the sheet X-ray is a row of `XRAY_COLUMNS` in system.py.
+- An arrangement of sources is a function in arrangements.py; its options are in `core/cli/geometry/generate.py`, its
+  settings in the window in `operators/xray.py`.
+- An isotope for dose is a line in decays.txt: energies per decay of ICRP 107. The tube spectra are a table that
+  `tools/tube_spectra.py` makes with SpekPy.
+- A mechanical check is a `Finding` and its search in checks.py (`find_in_room`).
 """

@@ -16,9 +16,8 @@ from ..errors import InputError, several
 from ..geometry.checks.field_of_view import find_blocked, hits, in_cone
 from ..geometry.checks.hulls import TOUCH, Hulls
 from ..geometry.checks.overlaps import penetration_depths
-from ..geometry.finding import Finding
 from ..geometry.module_parts import ModulePart
-from ..geometry.scanner import Scanner
+from ..geometry.scanner import Finding, Scanner
 from ..geometry.system import PinholeSystem
 from ..validation import instance, positive
 
@@ -102,7 +101,7 @@ def find_in_room(
         raise InputError(f"find_in_room: expected an X-ray system, got a {system.kind} system")
     bodies = [(f"the panel of source {panel.number}", panel) for panel in panels]
     for scanner in others:
-        parts = scanner.parts(construction if isinstance(scanner, PinholeSystem) else None)
+        parts = scanner.parts(construction)
         bodies += [(f"module {p.number}'s {p.kind}", p) for p in parts if p.kind != "source"]
     hulls, names = Hulls.from_parts([part for _, part in bodies]), [name for name, _ in bodies]
     depths = [_overlap_depths(hulls, m) for m in range(len(system))]

@@ -68,6 +68,7 @@ class SpectralScan(Model):
 
     name = "spectral"
     takes = ("mu",)
+    takes_ct_numbers = True
 
     def __post_init__(self) -> None:
         if not isinstance(self.system, XraySystem):
@@ -90,6 +91,10 @@ class SpectralScan(Model):
         if len(views) != len(self.system):
             raise InputError(f"spectral: expected {len(self.system)} views, one of each source, got {len(views)}")
 
+    def linear(self) -> Model:
+        """Return the model of the line integrals that `line_integrals` makes of the images."""
+        return Transmission()
+
     def beams(self, views: Views, m: int, grid: Grid) -> Iterator[Beam]:
         """Return the rays of the line integrals of view m."""
         return Transmission().beams(views, m, grid)
@@ -109,6 +114,14 @@ class SpectralScan(Model):
             return volume
         mu = virtual_monoenergetic(self._relative(volume, energy), self._names, CT_ENERGY)
         return Volume(np.asarray(mu, np.float32), volume.grid, "mu", volume.note)
+
+    in_model_quantity = at_ct_energy
+
+    def expected_images(
+        self, A: Projector, volume: Volume, progress: Progress | None = None, mu: Floats32 | None = None
+    ) -> Floats32:
+        """Return the expected images by `counts`, which no `mu` attenuates."""
+        return self.counts(volume, A, progress)
 
     def counts(self, volume: Volume, A: Projector, progress: Progress | None = None) -> Floats32:
         """Return the expected images (M, n_v, n_u) of a volume of mu at `CT_ENERGY`, without background.

@@ -9,10 +9,9 @@ import numpy as np
 from ..arrays import Array, ArrayLike, Bools, Floats, Integers
 from ..errors import InputError
 from ..geometry.columns import Column, ColumnTable, Values
-from ..geometry.finding import Finding
 from ..geometry.frames import affine_matrix
 from ..geometry.module_parts import BOX_FACES, ModulePart
-from ..geometry.scanner import Detector, Fault, Scanner, first_true
+from ..geometry.scanner import Detector, Fault, Finding, Scanner, first_true
 from ..geometry.views import Views
 from ..system_source import SystemSource
 from ..validation import lengths, positive, real_array, whole_shape

@@ -48,7 +48,7 @@ JUDGES = ("judge-known", "judge-scanners", "judge-pairs")
 
 
 def scanners(folder: Path) -> None:
-    """Workbooks of scanners that no training has seen: modules moved by 10 mm, wider holes, small misalignments."""
+    """Write workbooks of unseen scanners: modules moved by 10 mm, wider holes, small misalignments."""
     if (folder / "misaligned.xlsx").exists():  # the last one
         return
     shutil.copy(EXAMPLE, folder / "scanner.xlsx")
@@ -64,7 +64,7 @@ def scanners(folder: Path) -> None:
 
 
 def set_recipe(name: str) -> str:
-    """The recipe of a set: one of the package's, or the Derenzo test's with another scanner or other physics."""
+    """Return the recipe of a set: one of the package's, or the Derenzo test's with another scanner or other physics."""
     if name in ("moved", "holes", "misaligned"):
         return set_text("derenzo", f"{name}.xlsx")
     text = set_text(name if name in ("train", "unseen", "pairs") else "derenzo", "scanner.xlsx")
@@ -74,7 +74,7 @@ def set_recipe(name: str) -> str:
 
 
 def training_recipe(name: str) -> str:
-    """The recipe of a training and a seed, such as cameras-1."""
+    """Return the recipe of a training and a seed, such as cameras-1."""
     training, _, seed = name.rpartition("-")
     kind, steps, settings = TRAININGS[training]
     text = (HERE / "training.toml").read_text(encoding="utf-8")
@@ -85,7 +85,7 @@ def training_recipe(name: str) -> str:
 
 
 def trainings(have_begun: bool) -> list[str]:
-    """Those with seeds, that begin with the weights of another or do not."""
+    """Return the names of trainings with seeds, either those that begin with another's weights or the others."""
     return [
         f"{name}-{seed}"
         for seed in SEEDS
@@ -101,14 +101,14 @@ class Study:
         self.folder, self.jobs = folder, jobs
 
     def run(self, *words: str) -> None:
-        """One command of mphdrr; what it says is in a file of its name."""
+        """Run one command of mphdrr; its output goes to a file named after it."""
         with open(self.folder / f"{Path(words[-1]).stem}.log", "w", encoding="utf-8") as log:
             command = [sys.executable, "-m", "mphdrr", *words, "--quiet"]
             subprocess.run(command, cwd=self.folder, stdout=log, stderr=subprocess.STDOUT, check=True)
         print(*words, flush=True)
 
     def write(self, name: str, text: str) -> None:
-        """A recipe, where it is not there yet."""
+        """Write a recipe unless it exists."""
         if not (self.folder / name).exists():
             (self.folder / name).write_text(text, encoding="utf-8")
 
@@ -129,7 +129,7 @@ class Study:
         self.run("learn", "judge", f"{name}.toml", "-o", name)
 
     def all(self) -> None:
-        """Everything, in an order in which each has what it needs."""
+        """Run all steps in an order in which each has its inputs."""
         self.folder.mkdir(parents=True, exist_ok=True)
         scanners(self.folder)
         self.at_once(self.events, EVENTS)
@@ -140,7 +140,7 @@ class Study:
         study_figures.main(self.folder)
 
     def at_once(self, work: Callable[[str], None], names: Iterable[str]) -> None:
-        """Several works, `jobs` at a time; the first fault ends all."""
+        """Run works, `jobs` at a time; the first error ends all."""
         with ThreadPoolExecutor(self.jobs) as pool:
             list(pool.map(work, names))
 

@@ -57,11 +57,11 @@ class Findings:
                     self.baselines.append(row)
 
     def of(self, test: str, kind: str, level: float = 1.0) -> list[Row]:
-        """The rows of all seeds."""
+        """Return the rows of all seeds."""
         return [row for (*key, _), row in sorted(self.rows.items()) if key == [test, level, kind]]
 
     def errors(self, row: Row) -> Any:
-        """NRMSE of each event of a row."""
+        """Return the NRMSE of each event of a row."""
         events = EventSet(self.folder / "sets" / self.sets[row["test"]])
         kept = Records(row["file"])
         return np.array(
@@ -76,12 +76,12 @@ class Findings:
 
 
 def interval(values: Sequence[float]) -> str:
-    """A value with its interval."""
+    """Format a value with its interval."""
     return "{:.3f} [{:.3f}, {:.3f}]".format(*values)
 
 
 def over_seeds(rows: list[Row], name: str = "best_baseline") -> str:
-    """Mean and SD over training seeds of the ratio of NRMSE; of one seed its interval."""
+    """Format mean and SD over training seeds of the ratio of NRMSE; for one seed, its interval."""
     values = [row[name]["ratio"][0] for row in rows if name in row]
     if len(values) < 2:
         return interval(rows[0][name]["ratio"]) if values else ""
@@ -89,12 +89,12 @@ def over_seeds(rows: list[Row], name: str = "best_baseline") -> str:
 
 
 def table(heads: Sequence[str], lines: Sequence[Sequence[str]]) -> str:
-    """In Markdown."""
+    """Format a table in Markdown."""
     return "\n".join(f"| {' | '.join(line)} |" for line in (heads, ["---"] * len(heads), *lines)) + "\n"
 
 
 def known(found: Findings) -> str:
-    """The table of the scanner that was trained with."""
+    """Return the table of the scanner of the trainings."""
     lines = []
     for row in found.baselines:
         if row["test"] == "derenzo":
@@ -115,7 +115,7 @@ def known(found: Findings) -> str:
 
 
 def unknown(found: Findings) -> str:
-    """The table of other scanners, physics and counts: by the best baseline, and by method 1 of the same seed."""
+    """Return the table of other scanners, physics and counts: by the best baseline, and by method 1 of the same seed."""
     lines = []
     for test, level in dict.fromkeys((test, level) for test, level, *_ in found.rows):
         if test in ("derenzo", "unseen", "draws", "pairs"):
@@ -134,7 +134,7 @@ def unknown(found: Findings) -> str:
 
 
 def pairs(found: Findings) -> str:
-    """The table of rods left out or added."""
+    """Return the table of rods left out or added."""
     rows = [row for row in found.baselines if row["test"] == "pairs"]
     rows += [row for (test, *_), row in found.rows.items() if test == "pairs"]
     lines = [[row["method"], interval(row["sensitivity"]), interval(row["false_rods"])] for row in rows]
@@ -142,7 +142,7 @@ def pairs(found: Findings) -> str:
 
 
 def picture(found: Findings) -> Page:
-    """Middle slices of two events, and the learning curves by time and by events."""
+    """Draw middle slices of two events, and the learning curves by time and by events."""
     methods = ("after-osem", "cameras-begun", "unrolled-begun", "unrolled", "unrolled-permuted", "channels")
     page = Page(1660, 1130)
     text = "Middle slices of one event each; below, the NRMSE of validation events while they are trained, three seeds"
@@ -168,7 +168,7 @@ def picture(found: Findings) -> Page:
 
 
 def curves(found: Findings, page: Page, frame: Any, name: str, text: str, methods: Sequence[str]) -> None:
-    """Learning curves of all seeds."""
+    """Draw the learning curves of all seeds."""
     read = {(kind, path.parent.name): curve(path, kind, name) for kind in methods
             for path in sorted(found.folder.glob(f"{kind}-?-training/curve.json"))}  # fmt: skip
     most = max(x for xs, _ in read.values() for x in xs)
@@ -183,7 +183,7 @@ def curves(found: Findings, page: Page, frame: Any, name: str, text: str, method
 
 
 def curve(path: Path, kind: str, name: str) -> tuple[list[float], list[float]]:
-    """Seconds or events, and the NRMSE of validation events."""
+    """Return seconds or events, and the NRMSE of validation events."""
     rows, before = json.loads(path.read_text()), kind.endswith("-begun")
     own, first = (STEP[kind], BEFORE * STEP["after-osem"]) if name == "seconds" else (1.0, BEFORE)
     return [first * before + own * row["step"] for row in rows], [min(row["validation"], 0.9) for row in rows]

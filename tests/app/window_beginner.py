@@ -21,7 +21,7 @@ def clicks(name: str) -> Iterator[float]:
         yield from idle()
         yield from drawn()
     settings = scene.mphdrr_projections, scene.mphdrr_reconstruction
-    seen[name] += [settings[0].model, settings[1].method, settings[1].known["scores"][0][0], proposed()]
+    seen[name] += [settings[0].model, settings[1].method, settings[1].details["scores"][0][0], proposed()]
 
 
 def steps():

@@ -48,7 +48,7 @@ def steps():
     window, area, _ = editor("IMAGE_EDITOR")
     image = area.spaces.active.image
     seen["image"], seen["size"], seen["zoom"] = image.name, image.size[:], area.spaces.active.zoom[:]
-    seen["room"] = ours("addon.pictures.images").room(bpy.context)
+    seen["room"] = ours("addon.pictures.images").editor_size(bpy.context)
     seen["editor"] = [area.x, window.height - area.y - area.height, area.width, area.height]
 
 

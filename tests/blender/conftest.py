@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import functools
 import shutil
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
+from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
@@ -16,6 +19,8 @@ from mphdrr.addon.blender import jobs, plots, timers  # noqa: E402
 from mphdrr.addon.events import event_notes  # noqa: E402
 from mphdrr.addon.pictures import recoloring  # noqa: E402
 from mphdrr.addon.runs import preview  # noqa: E402
+from mphdrr.addon.scanner import scanner  # noqa: E402
+from mphdrr.core.geometry.scanner import Scanner  # noqa: E402
 from mphdrr.core.geometry.system import PinholeSystem  # noqa: E402
 from mphdrr.core.workbook import read_system, write_system  # noqa: E402
 
@@ -69,3 +74,109 @@ def ring_system() -> PinholeSystem:
     centers = np.concatenate([ring, ring * [1.0, 1.0, -1.3]])
     centers[:, 0] += 0.1234567890123
     return PinholeSystem(centers, 2.3, np.linspace(50.0, 71.0, 8) / 1.00000001, 48.0, 9.5, 60.0)
+
+
+@pytest.fixture
+def ring(scene, ring_system) -> bpy.types.Collection:
+    """The scanner of `ring_system` in the scene."""
+    collection = scanner.build_scanner(scene, ring_system, "Ring")
+    update()
+    return collection
+
+
+@pytest.fixture
+def imported(scene, small_workbook) -> bpy.types.Collection:
+    """The scanner of the small workbook in the scene."""
+    assert bpy.ops.mphdrr.import_geometry(filepath=str(small_workbook)) == {"FINISHED"}
+    return scanner.active_scanner(scene)
+
+
+@pytest.fixture
+def derenzo(ring) -> bpy.types.Object:
+    """A small phantom in the ring of eight modules, off centre and rotated; it is active."""
+    bpy.ops.mphdrr.add_derenzo(voxels=32, rod_diameters=(10, 8, 0, 0, 0, 0), location=(5, -3, 2), phi=0.2, theta=0.3)
+    return bpy.context.object
+
+
+def update() -> None:
+    bpy.context.view_layer.update()
+
+
+def select(*items: bpy.types.Object) -> None:
+    """Select these objects alone; the first becomes active."""
+    bpy.ops.object.select_all(action="DESELECT")
+    for item in items:
+        item.select_set(True)
+    bpy.context.view_layer.objects.active = items[0]
+    update()
+
+
+def part(camera: bpy.types.Object, name: str) -> bpy.types.Object:
+    """Return a part of a module: COLLIMATOR, CRYSTAL or PLANE."""
+    return next(child for child in camera.children if child.mphdrr_module.part == name)
+
+
+def module(number: int) -> bpy.types.Object:
+    """Return the camera of a module of the active scanner."""
+    return scanner.module(scanner.active_scanner(bpy.context.scene), number)
+
+
+def reopened(path: Path) -> bpy.types.Scene:
+    """Save the file, open it again, and return its scene."""
+    bpy.ops.wm.save_as_mainfile(filepath=str(path))
+    bpy.ops.wm.open_mainfile(filepath=str(path))
+    return bpy.context.scene
+
+
+def refused(operator: Callable[..., Any], words: str, **arguments: Any) -> None:
+    """Check that an operator refuses these arguments in one line, which matches `words`."""
+    with pytest.raises(RuntimeError, match=words) as refusal:
+        operator(**arguments)
+    assert len(str(refusal.value).strip().splitlines()) == 1 and "context is incorrect" not in str(refusal.value)
+
+
+def assert_same(one: Scanner, other: Scanner, tolerance: float = 0.0) -> None:
+    """Check that two scanners are of one kind and have the same numbers and values."""
+    assert type(one) is type(other) and one.numbers.tolist() == other.numbers.tolist()
+    for name, values in one.values().items():
+        if tolerance and values.dtype.kind == "f":
+            np.testing.assert_allclose(values, other.values()[name], rtol=tolerance, atol=tolerance, err_msg=name)
+        else:
+            np.testing.assert_array_equal(values, other.values()[name], err_msg=name)
+
+
+def datablocks(*kinds: str) -> dict[str, list[str]]:
+    """Return the names of the file's datablocks by kind: all kinds, or these."""
+    names = [name for name in kinds or dir(bpy.data) if not name.startswith("_")]
+    collections = {name: getattr(bpy.data, name) for name in names}
+    return {
+        name: sorted(block.name for block in blocks)
+        for name, blocks in collections.items()
+        if isinstance(blocks, bpy.types.bpy_prop_collection)
+    }
+
+
+def pixels(image: bpy.types.Image) -> np.ndarray:
+    """Return the colours (rows from the bottom, columns from the left, 4) of an image."""
+    values = np.empty(4 * image.size[0] * image.size[1], np.float32)
+    image.pixels.foreach_get(values)
+    return values.reshape(image.size[1], image.size[0], 4)
+
+
+class Drawn:
+    """A drawn panel: calls of its layout, the texts that it shows, and the owner of each property by name."""
+
+    def __init__(self, name: str, is_polled: bool = True) -> None:
+        self.panel, self.layout = getattr(bpy.types, name), MagicMock()
+        for kind in ("box", "column", "row", "split"):
+            getattr(self.layout, kind).return_value = self.layout
+        assert not is_polled or not hasattr(self.panel, "poll") or self.panel.poll(bpy.context)
+        self.panel.draw(self, bpy.context)
+        self.calls = self.layout.mock_calls
+        self.texts = [options["text"] for _, _, options in self.calls if options.get("text")]
+        self.properties = {
+            call.args[1].removesuffix("_unset"): call.args[0] for call in self.layout.prop.call_args_list
+        }
+
+    def __getattr__(self, name: str) -> Any:
+        return functools.partial(getattr(self.panel, name), self)

@@ -14,16 +14,28 @@ import pytest
 
 import mphdrr.core as mph
 from mphdrr.addon import example, next_step, registration
-from mphdrr.addon.blender import reports, storage
+from mphdrr.addon.blender import storage
 from mphdrr.addon.scanner import scanner
 from mphdrr.addon.volumes import slices, volumes
 
-PANELS = [cls for cls in registration.CLASSES if issubclass(cls, bpy.types.Panel) and cls.bl_space_type == "VIEW_3D"]
+from .conftest import module, update
+
+PANELS = [cls for cls in registration.CLASSES if issubclass(cls, bpy.types.Panel)]
 WIDTH = 236  # pixels for a panel's contents, in a sidebar of Blender's default width
 LABELS = 0.4  # share of settings' names, where they have a column of their own
 BESIDE = {"BOOLEAN": 20, "INT": 40, "FLOAT": 40}  # pixels beside a name in the same button: a box, or a number
 LETTERS, ICON, MARGIN = 11, 20, 4  # pixels
 BUTTON = 200  # pixels that whatever has a text asks for, however long that is, where it fills its place
+
+
+class Settings:
+    """Stands for the settings of an operator's button; those that do not exist cannot be set."""
+
+    def __init__(self, known: Any) -> None:
+        vars(self).update(known=known)
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        assert name in self.known.properties, f"{self.known.identifier}: {name}"
 
 
 class Layout:
@@ -68,10 +80,10 @@ class Layout:
         known = getattr(getattr(bpy.ops, group), name).get_rna_type()
         said = known.name if text is None else text
         self._leaf("button", said, icon, explained=bool(known.description.strip()), name=idname)
-        return type("Given", (), {})()
+        return Settings(known)
 
     def operator_menu_enum(self, idname: str, setting: str, **options: Any) -> None:
-        self.operator(idname, **options)
+        setattr(self.operator(idname, **options), setting, None)
 
     def menu(self, name: str, text: str = "", icon: str = "NONE") -> None:
         self._leaf("button", text, icon, explained=True, name=name)
@@ -82,14 +94,7 @@ class Layout:
         self._leaf("button", said, icon, explained=bool(known.bl_description), name=name, more=ICON)
 
     def prop(
-        self,
-        owner: Any,
-        name: str,
-        text: str | None = None,
-        icon: str = "NONE",
-        expand: bool = False,
-        toggle: bool = False,
-        **_: Any,
+        self, owner: Any, name: str, text: str | None = None, icon: str = "NONE", expand=False, toggle=False, **_: Any
     ) -> None:
         known = owner.bl_rna.properties[name]
         said = known.name if text is None else text
@@ -156,18 +161,20 @@ def is_popover(cls: type) -> bool:
     return "INSTANCED" in getattr(cls, "bl_options", ())
 
 
-def drawn(is_open: bool = False) -> dict[str, Layout]:
-    """The panels that are drawn, by their classes' names: those in sight to begin with, or all of them, open."""
+def is_top(cls: type) -> bool:
+    return not hasattr(cls, "bl_parent_id") and not is_popover(cls)
+
+
+def drawn(is_open: bool = False, space: str = "VIEW_3D") -> dict[str, Layout]:
+    """Return the panels that an editor draws, by their classes' names: those in sight at first, or all of them, open."""
     blf.size(0, LETTERS)
     seen: dict[str, Layout] = {}
-    for cls in sorted(PANELS, key=lambda cls: (is_popover(cls), hasattr(cls, "bl_parent_id"))):
+    panels = [cls for cls in PANELS if cls.bl_space_type == space]
+    for cls in sorted(panels, key=lambda cls: (is_popover(cls), hasattr(cls, "bl_parent_id"))):
         parent = getattr(cls, "bl_parent_id", None)
         is_hidden = is_popover(cls) and cls.__name__ not in names(seen, "button")
-        if (
-            is_hidden
-            or (hasattr(cls, "poll") and not cls.poll(bpy.context))
-            or (parent and not (parent in seen and seen[parent].is_open))
-        ):
+        is_closed = parent and not (parent in seen and seen[parent].is_open)
+        if is_hidden or is_closed or (hasattr(cls, "poll") and not cls.poll(bpy.context)):
             continue
         seen[cls.__name__] = layout = Layout(is_open=is_open or "DEFAULT_CLOSED" not in getattr(cls, "bl_options", ()))
         if layout.is_open:
@@ -179,9 +186,8 @@ def drawn(is_open: bool = False) -> dict[str, Layout]:
 
 
 def names(seen: dict[str, Layout], *what: str) -> list[str]:
-    return [
-        leaf["name"] for layout in seen.values() for leaf in layout.leaves() if leaf["what"] in what and "name" in leaf
-    ]
+    leaves = [leaf for layout in seen.values() for leaf in layout.leaves()]
+    return [leaf["name"] for leaf in leaves if leaf["what"] in what and "name" in leaf]
 
 
 def check(seen: dict[str, Layout]) -> None:
@@ -212,13 +218,9 @@ def worked(scene, dc_spect) -> Any:
 def test_a_beginner_sees_little(worked):
     seen = drawn()
     assert len(seen) <= 8
-    assert len(names(seen, "button")) <= 14 and len(names(seen, "property", "name")) <= 12
-    for name, layout in drawn(is_open=True).items():
-        cls = getattr(bpy.types, name)
-        if not hasattr(cls, "bl_parent_id") and not is_popover(cls):
-            assert (
-                len(names({name: layout}, "button")) <= 14 and len(names({name: layout}, "property", "name")) <= 12
-            ), name
+    tops = {name: layout for name, layout in drawn(is_open=True).items() if is_top(getattr(bpy.types, name))}
+    for shown in (seen, *({name: layout} for name, layout in tops.items())):
+        assert len(names(shown, "button")) <= 14 and len(names(shown, "property", "name")) <= 12, list(shown)
     check(seen)
 
 
@@ -250,7 +252,7 @@ def test_what_is_proposed_leads_to_a_score(scene, small_workbook):
     assert "NRMSE" in {name for name, _ in reconstruction.details["scores"]}
     assert next_step.next_step(bpy.context).text == "Export Dataset"
     scanner.module(scanner.active_scanner(scene), 3).location.x += 1.0
-    bpy.context.view_layer.update()
+    update()
     run = next(stage for stage in next_step.work_stages(bpy.context) if stage.name == "Run")
     assert run.is_stale and run.note == "Module 03 moved"
     check(drawn())
@@ -282,12 +284,8 @@ def test_ct_attenuation_spect_and_dose_are_six_clicks(scene, monkeypatch):
     # By hand: attenuated by the torso, reconstructed with the CT.
     run = mph.read_run(storage.absolute(settings.run_file))
     assert run.recipe["attenuation.object"] == "Cardiac Torso mu"
-    recipe = mph.Recipe(
-        {
-            f"reconstruction.{key}": value
-            for key, value in {"voxels": 28, "spacing": 16.0, "iterations": 3, "center": (35.0, -30.0, -30.0)}.items()
-        }
-    )
+    chosen = {"voxels": 28, "spacing": 16.0, "iterations": 3, "center": (35.0, -30.0, -30.0)}
+    recipe = mph.Recipe({f"reconstruction.{key}": value for key, value in chosen.items()})
     expected = mph.reconstruct_run(run, recipe, volumes.volume_from_object(ct)).volume.array
     found = volumes.volume_from_object(reconstruction.volume).array
     np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-4 * expected.max())
@@ -318,36 +316,36 @@ def test_the_numbers_of_the_only_volume_are_shown_whatever_is_selected(scene, ri
         bpy.ops.mphdrr.add_slices()
     planes = slices.planes_of(item)
     item.hide_set(True)
-    bpy.context.view_layer.update()
+    update()
     assert not any(plane.visible_get() for plane in planes)
     item.hide_set(False)
-    bpy.context.view_layer.update()
+    update()
     assert all(plane.visible_get() for plane in planes)
 
 
-def test_every_operator_and_setting_is_explained(scene):
-    silent = []
-    for cls in registration.CLASSES:
-        if issubclass(cls, bpy.types.Operator):
-            group, name = cls.bl_idname.split(".")
-            known = getattr(getattr(bpy.ops, group), name).get_rna_type()
-            silent += [] if known.description.strip() else [cls.bl_idname]
-        elif issubclass(cls, bpy.types.PropertyGroup):
-            known = cls.bl_rna
-        else:
-            continue
-        for each in known.properties:
-            is_group = each.type == "COLLECTION" or isinstance(
-                getattr(each, "fixed_type", None), bpy.types.PropertyGroup
-            )
-            is_own = each.identifier not in ("rna_type", "name") and not each.is_hidden and not is_group
-            silent += [f"{cls.__name__}.{each.identifier}"] if is_own and not each.description.strip() else []
-    assert not silent
+def test_panels_of_every_editor_draw_settings_and_buttons_that_exist(scene, ring_system):
+    def draw_all() -> int:
+        return sum(len(drawn(True, space)) for space in {cls.bl_space_type for cls in PANELS})
+
+    without = draw_all()
+    collection = scanner.build_scanner(scene, ring_system)
+    bpy.ops.mphdrr.check_geometry()
+    bpy.context.view_layer.objects.active = module(3)
+    assert draw_all() > without
+    collection.objects.link(module(2).copy())
+    update()
+    module(1).mphdrr_module.pinhole_diameter = 500.0
+    collection.mphdrr_scanner.findings = '["a finding that is too long for one line of the sidebar"]'
+    draw_all()
+    for add in (bpy.ops.mphdrr.add_derenzo, bpy.ops.mphdrr.add_torso):
+        assert add(voxels=12) == {"FINISHED"}
+        draw_all()
 
 
-def test_words_of_the_command_line_do_not_appear():
-    said = "no energy (--energy KEV): hu_to_mu(volume, energy), `mphdrr volume convert FILE`, or CT to Attenuation"
-    assert reports.in_window(said) == "no energy: hu_to_mu(volume, energy), or CT to Attenuation"
-    assert reports.in_window("a map can help (columns='map.toml', --columns map.toml; docs)") == (
-        "a map can help (columns='map.toml'; docs)"
-    )
+def test_labels_of_the_projections_fit_beside_their_fields(scene):
+    """At the default width a label has 85 pixels, with letters of 11; checkboxes have theirs on the right."""
+    blf.size(0, LETTERS)
+    properties = scene.mphdrr_projections.bl_rna.properties
+    labels = {p.name for p in properties if p.type != "BOOLEAN" and not p.is_hidden}
+    assert len(labels) > 20
+    assert {name for name in labels if blf.dimensions(0, name)[0] > 85} == set()

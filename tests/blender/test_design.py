@@ -16,6 +16,8 @@ from mphdrr.addon.scanner import collimators, following, live_scanner, module_ed
 from mphdrr.core.errors import InputError, InputWarning
 from mphdrr.core.geometry.system import PinholeSystem
 
+from .conftest import part, refused, reopened, select, update
+
 
 @pytest.fixture
 def roi_system(ring_system) -> PinholeSystem:
@@ -30,14 +32,6 @@ def collection(scene, roi_system):
     made = scanner.build_scanner(scene, roi_system)
     update()
     return made
-
-
-def update() -> None:
-    bpy.context.view_layer.update()
-
-
-def part(camera: bpy.types.Object, name: str) -> bpy.types.Object:
-    return next(c for c in camera.children if c.mphdrr_module.part == name)
 
 
 def depth(camera: bpy.types.Object) -> tuple[float, float]:
@@ -345,13 +339,6 @@ def test_blenders_own_duplicate_and_delete_are_tidied(collection):
     assert_consistent(collection)
 
 
-def select(*items: bpy.types.Object) -> None:
-    bpy.ops.object.select_all(action="DESELECT")
-    for item in items:
-        item.select_set(True)
-    bpy.context.view_layer.objects.active = items[0]
-
-
 def test_duplicates_stand_along_the_ring(collection, roi_system):
     select(scanner.module(collection, 2), scanner.module(collection, 6))
     assert bpy.ops.mphdrr.duplicate_modules(count=2, angle=np.radians(12.0)) == {"FINISHED"}
@@ -366,8 +353,7 @@ def test_duplicates_stand_along_the_ring(collection, roi_system):
     b, d, side, roi = (system.pinhole_distance, system.pinhole_diameter, system.detector_side, system.roi_radius)
     assert np.allclose(system.collimator_length, mph.collimator_length(b, d, side, roi), rtol=1e-12, atol=0)
     assert_consistent(collection)
-    with pytest.raises(RuntimeError, match="place of another module"):
-        bpy.ops.mphdrr.duplicate_modules(count=1, angle=0.0)
+    refused(bpy.ops.mphdrr.duplicate_modules, "place of another module", count=1, angle=0.0)
 
     made = module_edits.duplicate_modules(
         collection, [scanner.module(collection, 1)], 1, np.radians(30.0), follow_ring=True
@@ -391,8 +377,7 @@ def test_modules_are_removed_with_their_parts(collection):
     assert np.allclose(objects.world_matrix(marker), place, atol=1e-4)
     assert_consistent(collection)
     select(*scanner.modules(collection))
-    with pytest.raises(RuntimeError, match="at least one module"):
-        bpy.ops.mphdrr.remove_modules()
+    refused(bpy.ops.mphdrr.remove_modules, "at least one module")
 
 
 def test_check_marks_the_modules_until_something_changes(collection):
@@ -420,8 +405,7 @@ def test_files_with_shared_meshes_are_loaded(collection, tmp_path):
         for name in ("COLLIMATOR", "CRYSTAL"):
             part(camera, name).data = part(cameras_[0], name).data
     path = str(tmp_path / "old.blend")
-    bpy.ops.wm.save_as_mainfile(filepath=path)
-    bpy.ops.wm.open_mainfile(filepath=path)
+    reopened(path)
     assert_consistent(scanner.active_scanner(bpy.context.scene))
 
 
@@ -449,8 +433,7 @@ def test_collimators_of_an_older_file_get_their_knife_edge(collection, tmp_path)
     for name in ("opening_angle", "edge_at"):
         collection.mphdrr_scanner.property_unset(name)
     path = str(tmp_path / "old.blend")
-    bpy.ops.wm.save_as_mainfile(filepath=path)
-    bpy.ops.wm.open_mainfile(filepath=path)
+    reopened(path)
     loaded = scanner.active_scanner(bpy.context.scene)
     assert_consistent(loaded)
     for camera in scanner.modules(loaded):

@@ -17,6 +17,8 @@ from mphdrr.core.runs.display import Display
 from mphdrr.core.runs.mosaic import as_seen
 from mphdrr.core.volumes.volume import Volume
 
+from .conftest import reopened, update
+
 POINT = np.array([9.0, -6.0, 12.0])
 
 
@@ -28,7 +30,7 @@ def projected(scene, ring_system):
 
     def project(**settings):
         assert bpy.ops.mphdrr.render_projections(**{"width": 50, "height": 40} | settings) == {"FINISHED"}
-        bpy.context.view_layer.update()
+        update()
         return planes.planes(scene)
 
     return project
@@ -137,7 +139,7 @@ def test_the_central_half_is_a_run_of_half_the_side(projected, scene, detector):
     settings.automatic, settings.high = False, 20.0
 
     def pictures():
-        bpy.context.view_layer.update()
+        update()
         made = planes.planes(scene)
         pixels = [np.array(bpy.data.images[ids.picture_name(f"mphDRR 0{n}")].pixels) for n in (2, 7)]
         views = [
@@ -179,7 +181,7 @@ def test_planes_of_the_active_module_its_ring_or_all_that_are_visible(projected,
     settings, collection = scene.mphdrr_display, scanner.active_scanner(scene)
 
     def shown():
-        bpy.context.view_layer.update()
+        update()
         return [plane.mphdrr_module.number for plane in made if not plane.hide_viewport]
 
     assert shown() == list(range(1, 9))
@@ -202,7 +204,7 @@ def test_planes_go_with_their_modules(projected, scene):
     assert [plane.mphdrr_module.number for plane in planes.planes(scene)] == [2, 3, 4, 5, 6, 7, 8]
     assert ids.picture_name(images.projection_name(1, range(8))) in bpy.data.images, "the run's pictures stay"
     bpy.data.objects.remove(scanner.module(collection, 5))  # as X does
-    bpy.context.view_layer.update()
+    update()
     assert [plane.mphdrr_module.number for plane in planes.planes(scene) if plane.hide_viewport] == [5]
     scene.mphdrr_display.plane_opacity = 0.3
 
@@ -232,8 +234,7 @@ def test_pictures_and_planes_survive_the_file(projected, scene, tmp_path):
     before = [tuple(plane.matrix_world.translation) for plane in projected()]
     name = ids.picture_name(ids.projection_name(2, 8))
     seen = brightest(bpy.data.images[name])
-    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "a.blend"))
-    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "a.blend"))
+    reopened(tmp_path / "a.blend")
     made = planes.planes(bpy.context.scene)
     np.testing.assert_allclose([tuple(plane.matrix_world.translation) for plane in made], before)
     assert brightest(bpy.data.images[name]) == seen
@@ -246,7 +247,7 @@ def test_backgrounds_are_as_large_as_their_camera_sees_them(projected, scene):
     camera, (background,) = plane.parent, plane.parent.data.background_images
     before, angle = background.scale, camera.data.angle_x
     camera.mphdrr_module.collimator_length *= 1.25  # the camera sees less, and so more of its view is covered
-    bpy.context.view_layer.update()
+    update()
     assert background.scale == pytest.approx(before * np.tan(angle / 2) / np.tan(camera.data.angle_x / 2), rel=1e-4)
     assert background.scale > 1.2 * before
 

@@ -17,6 +17,8 @@ from mphdrr.core.geometry.grid import Grid
 from mphdrr.core.perspective.perspective_grid import PerspectiveGrid
 from mphdrr.core.volumes.volume import Volume
 
+from .conftest import refused, reopened, update
+
 POINT = np.array([9.0, -6.0, 12.0])
 
 
@@ -28,7 +30,7 @@ def projected(scene, ring_system):
 
     def project(**settings):
         assert bpy.ops.mphdrr.render_projections(**{"width": 90, "height": 60} | settings) == {"FINISHED"}
-        bpy.context.view_layer.update()
+        update()
         return epipolar.run_views(scene)
 
     return project
@@ -105,15 +107,13 @@ def test_epipoles_are_where_pinholes_are_seen(projected, scene):
 
 
 def test_what_is_impossible_is_refused_in_a_line(projected, scene):
-    with pytest.raises(RuntimeError, match="No projections yet"):
-        bpy.ops.mphdrr.pick_pixel(module=1)
+    refused(bpy.ops.mphdrr.pick_pixel, "No projections yet", module=1)
     projected()
     for wrong, said in (
         ({"module": 9}, "module 9: the shown run has none of this number"),
         ({"module": 1, "column": 90}, r"column 90, row 0: the images have columns 0 to 89 and rows 0 to 59"),
     ):
-        with pytest.raises(RuntimeError, match=said):
-            bpy.ops.mphdrr.pick_pixel(**wrong)
+        refused(bpy.ops.mphdrr.pick_pixel, said, **wrong)
         assert epipolar.picked_pixel(scene) is None
     bpy.ops.mphdrr.pick_pixel(module=1, column=3, row=4)
     scene.mphdrr_epipolar.row = 61
@@ -125,8 +125,7 @@ def test_what_is_impossible_is_refused_in_a_line(projected, scene):
     assert epipolar.picked_pixel(scene).index == 1
     del bpy.data.images[ids.MOSAIC]["mphdrr_views"]
     epipolar._runs.clear()
-    with pytest.raises(RuntimeError, match="kept by an earlier version"):
-        bpy.ops.mphdrr.pick_pixel(module=1)
+    refused(bpy.ops.mphdrr.pick_pixel, "kept by an earlier version", module=1)
 
 
 def test_a_pixel_stays_picked_while_runs_have_its_views(projected, scene, tmp_path):
@@ -141,9 +140,7 @@ def test_a_pixel_stays_picked_while_runs_have_its_views(projected, scene, tmp_pa
     assert epipolar.picked_pixel(scene) is None and scene.mphdrr_epipolar.along == 0, "pixels of other views"
     bpy.ops.mphdrr.show_run(index=0)
     assert epipolar.picked_pixel(scene).marker.tolist() == before.marker.tolist()
-    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "kept.blend"))
-    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "kept.blend"))
-    scene = bpy.context.scene
+    scene = reopened(tmp_path / "kept.blend")
     assert epipolar.picked_pixel(scene).marker.tolist() == before.marker.tolist(), "saved"
     assert bpy.ops.mphdrr.clear_pixel() == {"FINISHED"} and epipolar.picked_pixel(scene) is None
     bpy.ops.mphdrr.pick_pixel(module=2, column=33.3, row=21)
@@ -201,7 +198,7 @@ def test_a_line_of_sight_to_a_plane_meets_the_pixel_that_it_shows(projected, sce
     scene.mphdrr_display.half = half
     run = projected(detector=detector)
     scene.mphdrr_display.plane_distance = 60.0
-    bpy.context.view_layer.update()
+    update()
     for number, column, row in ((2, 41, 33), (7, 50, 20)):
         source, targets = run.views.sources[number - 1], run.views.rays(number - 1)[1].reshape(60, 90, 3)
         way = targets[row, column] - source
@@ -211,7 +208,7 @@ def test_a_line_of_sight_to_a_plane_meets_the_pixel_that_it_shows(projected, sce
         found = epipolar_drawing.plane_pixel(bpy.context, run, source + 0.01 * way, way)
         assert found is None or found[0] != number, "from behind, a plane is not seen"
     scene.mphdrr_display.planes = "NONE"
-    bpy.context.view_layer.update()
+    update()
     assert epipolar_drawing.plane_pixel(bpy.context, run, on_ray, -way) is None
 
 

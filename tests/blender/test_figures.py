@@ -1,4 +1,4 @@
-"""Figures of a scene: rendered in a studio that leaves no trace, and the same by operator, function and command."""
+"""Figures, pictures and animations of a scene, rendered in a studio that leaves no trace; the light of scenes."""
 
 from __future__ import annotations
 
@@ -8,29 +8,30 @@ import sys
 import bpy
 import numpy as np
 import pytest
+from mathutils import Vector
 from PIL import Image
 
 import mphdrr.core as mph
-from mphdrr.addon.blender import jobs, storage
+from mphdrr.addon.blender import ids, jobs, storage
 from mphdrr.addon.cli import main
 from mphdrr.addon.cli.scene import save_scene
-from mphdrr.addon.figures import engine, figures
+from mphdrr.addon.figures import engine, figures, studio
+from mphdrr.addon.figures.stage import FigureScene
 from mphdrr.addon.runs import rendering
-from mphdrr.addon.scanner import scanner
+from mphdrr.addon.scanner import scanner, selection
 from mphdrr.addon.volumes import volumes
 from mphdrr.core.figures.page import Page
 from mphdrr.core.recording import recorded_warnings
 
+from .conftest import datablocks, pixels, refused, update
+
 
 def state() -> tuple:
-    """What the user has: datablocks, what is hidden, selected and active, and the scene's settings."""
-    kinds = {kind: getattr(bpy.data, kind) for kind in dir(bpy.data)}
-    counts = {kind: len(found) for kind, found in kinds.items() if isinstance(found, bpy.types.bpy_prop_collection)}
-    scene = bpy.context.scene
+    """Return what the user has: datablocks, what is hidden, selected and active, and the scene's settings."""
+    scene, render = bpy.context.scene, bpy.context.scene.render
     objects = [(o.name, o.hide_viewport, o.hide_render, o.select_get(), o.data and o.data.users) for o in scene.objects]
-    render = scene.render
     look = render.engine, render.resolution_x, render.filepath, scene.camera, scene.world, scene.frame_current
-    return counts, objects, look, bpy.context.view_layer.objects.active, bpy.context.scene.name
+    return datablocks(), objects, look, bpy.context.view_layer.objects.active, bpy.context.scene.name
 
 
 @pytest.fixture
@@ -46,7 +47,7 @@ def example(scene, dc_spect, tmp_path):
     mph.write_run(run, tmp_path / "run.h5")
     rendering.show_run(scene, run, tmp_path / "run.h5", item)
     scanner.show_modules(collection, 5, 41)
-    bpy.context.view_layer.update()
+    update()
     return scene
 
 
@@ -111,24 +112,18 @@ def test_the_c_arm_is_the_active_modules(example, tmp_path):
 
 
 def test_figures_refuse_what_is_not_there(scene, dc_spect, tmp_path):
-    path = str(tmp_path / "a.png")
-    with pytest.raises(RuntimeError, match="Nothing to show: import a workbook or add a phantom first"):
-        bpy.ops.mphdrr.export_figure(filepath=path)
+    arguments, export = {"filepath": str(tmp_path / "a.png"), "figure": "C_ARM"}, bpy.ops.mphdrr.export_figure
+    refused(export, "Nothing to show: import a workbook or add a phantom first", filepath=arguments["filepath"])
     scanner.build_scanner(scene, dc_spect[:4])
-    for figure, message in (
-        ("SUMS", "no volume in the scene"),
-        ("MOSAIC", "no projections"),
-        ("CUT_AWAY", "no volume"),
-    ):
-        with pytest.raises(RuntimeError, match=message):
-            bpy.ops.mphdrr.export_figure(filepath=path, figure=figure)
-    for given, message in (
+    for changes, message in (
+        ({"figure": "SUMS"}, "no volume in the scene"),
+        ({"figure": "MOSAIC"}, "no projections"),
+        ({"figure": "CUT_AWAY"}, "no volume"),
         ({"width": 900}, "give both width and height, or neither"),
         ({"modules": "90"}, "no module 90; there are 1 to 4"),
         ({"filepath": str(tmp_path / "a.bmp")}, r"expected a name ending in .png, .svg"),
     ):
-        with pytest.raises(RuntimeError, match=message):
-            bpy.ops.mphdrr.export_figure(**{"filepath": path, "figure": "C_ARM", **given})
+        refused(export, message, **(arguments | changes))
     assert not list(tmp_path.iterdir())
 
 
@@ -204,7 +199,7 @@ def small_render(example):
     render, example.camera = example.render, scanner.modules(scanner.active_scanner(example))[0]
     render.engine, example.cycles.samples = "CYCLES", 1
     render.resolution_x = render.resolution_y = 16
-    bpy.context.view_layer.update()
+    update()
     return example
 
 
@@ -227,7 +222,7 @@ def test_render_says_which_volumes_of_the_view_it_lacks(small_render, capfd, mon
     home.hide_render = True
     assert "is hidden in renders" in rendered(small_render, capfd)
     home.hide_render = False
-    bpy.context.view_layer.update()
+    update()
     assert rendered(small_render, capfd) == ""
     volumes.file_of(item).unlink()
     storage._cached_size.cache_clear()
@@ -244,7 +239,7 @@ def test_render_says_what_cycles_does_not_draw(small_render, capfd, has_scanner)
         small_render.collection.objects.link(small_render.camera)
         small_render.collection.children.unlink(scanner.active_scanner(small_render))
         item.location = (250.0, -300.0, 120.0)
-        bpy.context.view_layer.update()
+        update()
     figures._known_visible.clear()
     assert rendered(small_render, capfd) == ""
     assert figures._known_visible, "it was tried"
@@ -261,3 +256,158 @@ def test_figures_of_volumes_are_not_made_of_runs_that_have_none(dc_spect, tmp_pa
         assert main(["figure", kind, str(tmp_path / "run.h5"), "-o", str(tmp_path / "a.png")]) == 1
         assert "needs a volume" in capsys.readouterr().err
     assert not (tmp_path / "a.png").exists()
+
+
+SIZE = (192, 120)
+PAPERS = {"dark": (20, 22, 26), "light": (255, 255, 255)}
+
+
+@pytest.fixture
+def pictured(scene, dc_spect):
+    scanner.build_scanner(scene, dc_spect[::8])
+    volume = mph.DerenzoPhantom(40, (12, 10, 8, 8, 6, 6), 40, 100).voxelize(mph.Grid.centered(24, 4.0))
+    return volumes.add_volume(volume, "Derenzo")
+
+
+def share_of_phantom(shown: np.ndarray) -> float:
+    """Of pixels that are purple or pink, as activity is and nothing else."""
+    red, green, blue = np.moveaxis(shown, -1, 0)
+    return float(np.mean((red - green > 40) & (blue - green > 20)))
+
+
+def share_of_paper(shown: np.ndarray, style: str) -> float:
+    return float(np.mean((np.abs(shown - PAPERS[style]) <= 2).all(axis=-1)))
+
+
+def share_of_lit(shown: np.ndarray) -> float:
+    """Of pixels in the orange of rays and lit modules."""
+    return float(np.mean(shown[..., 0] - shown[..., 2] > 60))
+
+
+def test_a_picture_shows_the_phantom_on_its_paper(pictured, tmp_path):
+    """On light paper; animations are on dark."""
+    path, style = tmp_path / "picture.png", "light"
+    common = {"filepath": str(path), "style": style, "width": SIZE[0], "height": SIZE[1], "samples": 2}
+    bpy.ops.mphdrr.render_picture(**common, labels=False)
+    shown = picture(path)
+    assert share_of_phantom(shown) > 0.02 and share_of_paper(shown, style) > 0.1 and share_of_lit(shown) > 0.02
+    for other in set(PAPERS) - {style}:
+        assert share_of_paper(shown, other) < 0.02
+
+
+def test_an_animation_has_the_phantom_on_its_first_and_last_picture(pictured, tmp_path):
+    left, right = scanner.modules(scanner.active_scanner(bpy.context.scene))[3:5]
+    selection.select(bpy.context, (left, right))
+    for kind in ("TURNTABLE", "LIGHT_UP"):
+        path, folder = tmp_path / f"{kind}.mp4", tmp_path / f"{kind}-frames"
+        folder.mkdir()
+        (folder / f"{kind}-0099.png").touch()  # of a longer one before
+        bpy.ops.mphdrr.render_animation(
+            filepath=str(path), figure=kind, width=SIZE[0], height=SIZE[1], samples=1, seconds=0.2, fps=10, labels=False
+        )
+        frames = sorted(folder.iterdir())
+        assert [frame.name for frame in frames] == [f"{kind}-{k:04d}.png" for k in (1, 2)]
+        first, last = picture(frames[0]), picture(frames[-1])
+        assert min(share_of_phantom(first), share_of_phantom(last)) > 0.008
+        assert min(share_of_paper(first, "dark"), share_of_paper(last, "dark")) > 0.1
+        assert np.abs(first - last).max() > 60, "something happens"
+        clip = bpy.data.movieclips.load(str(path))
+        assert (tuple(clip.size), clip.frame_duration, clip.fps) == (SIZE, 2, 10)
+    assert share_of_lit(last) > share_of_lit(first), "the second module is lit beside the first"
+    assert not [scene for scene in bpy.data.scenes if scene.name.startswith("mphDRR")]
+
+
+def test_an_animation_that_is_ended_keeps_its_pictures(pictured, tmp_path, monkeypatch):
+    monkeypatch.setattr(
+        figures, "_render_pixels", lambda scene: (yield) or np.full((SIZE[1], SIZE[0], 3), 200, np.uint8)
+    )
+    monkeypatch.setattr(figures, "_are_visible", lambda *_: (yield) or True)
+    path = tmp_path / "film.mp4"
+    path.write_bytes(b"older")
+
+    def started(**more):
+        job = figures.figure_job(bpy.context, "turntable", [path], SIZE, seconds=1.0, fps=9, **more)
+        steps = job.finish(job.work(lambda done, total: None))
+        while next(steps) != ("rendering pictures", 3, 9):
+            pass
+        return job, steps
+
+    job, steps = started()
+    with pytest.raises(mph.Cancelled):
+        steps.throw(mph.Cancelled())
+    assert job.leftovers() == f"3 pictures are in {tmp_path / 'film-frames'}"
+    assert len(list((tmp_path / "film-frames").iterdir())) == 3 and path.read_bytes() == b"older"
+    job, steps = started()
+    job.finish_now.set()
+    list(steps)
+    assert bpy.data.movieclips.load(str(path)).frame_duration == 3
+    assert sorted(found.name for found in tmp_path.iterdir()) == ["film-frames", "film.mp4"]
+
+
+def test_a_volume_that_cycles_does_not_draw_is_a_surface(pictured, tmp_path, monkeypatch):
+    """As in a Blender whose Cycles draws no volumes: here the stage has it far away."""
+    put = FigureScene._add_volume
+
+    def put_far_away(stage: FigureScene, item: bpy.types.Object) -> None:
+        put(stage, item)
+        stage.volume_objects[0].location.z += 1e5
+
+    monkeypatch.setattr(FigureScene, "_add_volume", put_far_away)
+    path = tmp_path / "picture.png"
+    with recorded_warnings() as said:
+        jobs.run(figures.figure_job(bpy.context, "picture", [path], SIZE, labels=False, samples=2))
+    (text,) = said
+    assert text.startswith("the picture shows 'Derenzo' as the surface at 50 kBq/mL") and "no volumes" in text
+    assert share_of_phantom(picture(path)) > 0.02
+
+
+def test_animations_refuse_what_cannot_be(tmp_path, capsys):
+    common = ["figure", "light-up", "scene.blend", "-o"]
+    for words, said in (
+        (["a.png"], "expected a name ending in .mp4"),
+        (["a.mp4", "--size", "321x200"], "size 321x200: both must be even for an animation"),
+        (["a.mp4", "--seconds", "0"], "0 s of 24 pictures each: expected more than 0 for both"),
+    ):
+        assert main([*common, str(tmp_path / words[0]), *words[1:]]) == 1
+        assert said in capsys.readouterr().err
+
+
+def studios(scene) -> list[bpy.types.Collection]:
+    return [c for c in scene.collection.children if c.name.startswith(ids.STUDIO)]
+
+
+def test_an_imported_scanner_is_lit_once(scene, small_workbook):
+    world = scene.world
+    for _ in range(2):
+        bpy.ops.mphdrr.import_geometry(filepath=str(small_workbook))
+        (home,) = studios(scene)
+        assert {item.data.type for item in home.objects} == {"SUN"}
+    assert scene.world == world and not scene.objects["Light"].hide_viewport
+
+
+def test_a_scene_with_light_of_its_own_keeps_it(scene, ring_system):
+    scene.objects["Light"].data.type = "AREA"
+    studio.light(scene)
+    assert not studios(scene)
+    scene.world = None
+    bpy.data.objects.remove(scene.objects["Light"])
+    studio.light(scene)
+    assert len(studios(scene)) == 1 and scene.world.name == ids.STUDIO
+
+
+@pytest.mark.parametrize("world", ["the startup file's", "none"])
+def test_a_rendered_scanner_is_neither_black_nor_bleached(scene, dc_spect, tmp_path, world):
+    if world == "none":
+        scene.world = None
+    scanner.build_scanner(scene, dc_spect[::4])
+    studio.light(scene)
+    camera = studio.new_aimed_object(bpy.data.cameras.new("View"), Vector((0, 60, 0)), Vector((550, -400, 400)))
+    camera.data.clip_end = 5000.0
+    scene.collection.objects.link(camera)
+    scene.camera, scene.render.engine, scene.cycles.samples = camera, "CYCLES", 1
+    scene.render.resolution_x = scene.render.resolution_y = 64
+    scene.render.filepath = str(tmp_path / "view.png")
+    bpy.ops.render.render(write_still=True)
+    picture = pixels(bpy.data.images.load(scene.render.filepath))[..., :3]
+    assert 0.15 < picture.mean() < 0.6
+    assert np.ptp(picture.mean(axis=2)) > 0.3, "lit sides and sides in shadow"

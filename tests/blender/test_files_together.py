@@ -1,22 +1,32 @@
-"""A .blend and its folder stay together: Save As, moves, names, Collect Files."""
+"""A .blend and its folder stay together: Save As, moves, names, Collect Files, crashes and full disks."""
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import shutil
+import subprocess
+from collections.abc import Iterator
 from pathlib import Path
 
 import bpy
 import numpy as np
 import pytest
 
-from mphdrr.addon.blender import storage
+import mphdrr.core as mph
+from mphdrr.addon import recovery
+from mphdrr.addon.blender import jobs, storage
+from mphdrr.addon.cli.scene import new_scene, save_scene
+from mphdrr.addon.phantoms import phantom_properties, phantoms
 from mphdrr.addon.runs import runs
 from mphdrr.addon.scanner import scanner
 from mphdrr.addon.volumes import volumes
+from mphdrr.addon.volumes.vdb import read_vdb, write_vdb
 from mphdrr.core.geometry.grid import Grid
 from mphdrr.core.runs.files import read_run
 from mphdrr.core.volumes.volume import Volume
+
+from .conftest import refused, update
 
 SMALL = {"width": 12, "height": 10}
 
@@ -175,3 +185,102 @@ def test_a_full_disk_leaves_the_files_where_they_are(study, tmp_path, monkeypatc
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "b.blend"))
     assert "No space left on device" in capfd.readouterr().out
     is_whole(study.parent, expected)
+
+
+TANK = {"rod_diameters": (0,) * 6, "sphere_diameters": (30, 0, 0, 0, 0, 0)}  # little to paint
+
+
+@pytest.fixture
+def crashed(scene, small_workbook, tmp_path, capsys):
+    """A scene with volumes of every origin, opened again after their files have gone; returns their voxels by name."""
+    bpy.ops.mphdrr.import_geometry(filepath=str(small_workbook))
+    job = phantoms.add_phantom_job(phantom_properties.plain_settings("jaszczak", voxels=24, **TANK), "Tank", None, True)
+    jobs.run(job)
+    bpy.data.objects["Tank"].location = (3.0, 4.0, 5.0)
+    bpy.ops.mphdrr.add_map(quantity="modules", voxels=6, side=90, within_roi=False)
+    update()
+    made = {item.name: volumes.volume_from_object(item) for item in volumes.volume_objects(scene)}
+    volumes.add_volume(Volume(np.ones((4, 4, 4)), Grid.centered(4, 1.0), "hu"), "CT")
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "study.blend"))
+    shutil.rmtree(tmp_path / "study_mphdrr")
+    storage._cached_size.cache_clear()
+    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "study.blend"))
+    said = capsys.readouterr().out
+    assert "Modules map, Tank are missing: press Make Again" in said
+    assert "CT are missing: Find Missing Volume Files, or import again" in said
+    return made
+
+
+def test_one_update_gives_one_grid(crashed):
+    item = bpy.data.objects["Tank"]
+    bpy.context.view_layer.objects.active = item
+    assert not item.data.grids.load()
+    assert bpy.ops.mphdrr.update_phantom() == {"FINISHED"}
+    assert item.data.grids.load() and [grid.name for grid in item.data.grids] == ["activity"]
+    assert np.array_equal(volumes.volume_from_object(item).array, crashed["Tank"].array)
+
+
+def test_all_with_a_recipe_are_made_again_where_they_were(crashed, capsys):
+    storage._cached_size.cache_clear()
+    assert bpy.ops.mphdrr.remake_volumes() == {"FINISHED"}
+    assert "CT: find the voxel files" in capsys.readouterr().out
+    storage._cached_size.cache_clear()
+    again, others = recovery.missing_volumes(bpy.context.scene)
+    assert again == [] and [item.name for item in others] == ["CT"]
+    assert set(crashed) == {"Tank", "Tank mu", "Modules map"}
+    for name, volume in crashed.items():
+        back = volumes.volume_from_object(bpy.data.objects[name])
+        assert np.array_equal(back.array, volume.array)
+        np.testing.assert_allclose(back.grid.affine, volume.grid.affine, atol=1e-6)
+    refused(bpy.ops.mphdrr.remake_volumes, "No phantom or map misses its file")
+
+
+SIZE = 64 << 10
+
+
+@pytest.fixture
+def disk(tmp_path: Path) -> Iterator[Path]:
+    folder = tmp_path / "disk"
+    folder.mkdir()
+    with contextlib.suppress(OSError):
+        command = ["mount", "-t", "tmpfs", "-o", f"size={SIZE}", "none", str(folder)]
+        if subprocess.run(command, capture_output=True).returncode == 0:
+            yield folder
+            subprocess.run(["umount", "--lazy", str(folder)], check=True)
+            return
+    pytest.skip("no small disk can be mounted here")
+
+
+@pytest.mark.parametrize("side", [26, 40])
+def test_voxels_on_a_full_disk_are_one_line_and_leave_the_old_file(disk, side):
+    """OpenVDB itself says nothing, and leaves a file that reads as other numbers."""
+    rng = np.random.default_rng(side)
+    grid = mph.Grid((side,) * 3, np.eye(4))
+    small = mph.Volume(np.ones((2, 2, 2), np.float32), mph.Grid((2, 2, 2), np.eye(4)), "mu")
+    path = disk / "a.vdb"
+    write_vdb(small, path)
+    with pytest.raises(mph.InputError, match="cannot be written"):
+        write_vdb(mph.Volume(rng.random(grid.shape, np.float32), grid, "mu"), path)
+    assert list(disk.iterdir()) == [path]
+    assert np.array_equal(read_vdb(path).array, small.array)
+
+
+def test_a_blend_on_a_full_disk_is_one_line(disk):
+    new_scene()
+    mesh = bpy.data.meshes.new("points")  # more than the disk holds, and not to be compressed
+    mesh.from_pydata(np.random.default_rng(0).random((20_000, 3)), [], [])
+    bpy.context.scene.collection.objects.link(bpy.data.objects.new("points", mesh))
+    with pytest.raises(mph.InputError, match="cannot be written") as error:
+        save_scene(disk / "a.blend")
+    assert "\n" not in str(error.value)
+    assert list(disk.iterdir()) == []
+
+
+def test_a_figure_on_a_full_disk_is_one_line_and_status_1(disk, small_workbook, capsys):
+    from mphdrr.__main__ import main
+
+    (disk / "other").write_bytes(bytes(SIZE))
+    words = ["figure", "scanner", str(small_workbook), "--size", "120x120", "--samples", "1", "-o", str(disk / "a.png")]
+    assert main(words) == 1
+    assert "No space left on device" in capsys.readouterr().err
+    assert [path.name for path in disk.iterdir()] == ["other"]

@@ -14,6 +14,8 @@ from mphdrr.addon.volumes import slices, volumes
 from mphdrr.core.progress import Cancelled
 from mphdrr.core.runs.mosaic import as_seen
 
+from .conftest import refused, reopened, update
+
 SHAPE = 18, 26  # rows, columns
 
 
@@ -36,7 +38,7 @@ def choose(number: int) -> bpy.types.Object:
     active = bpy.context.view_layer.objects.active
     scene.mphdrr_geometry.active_index = collection.all_objects.find(camera.name)
     bpy.context.view_layer.objects.active = active
-    bpy.context.view_layer.update()
+    update()
     return camera
 
 
@@ -85,7 +87,7 @@ def test_layers_stand_on_the_rays_of_their_pixels_and_show_their_means(shown, sc
     assert bpy.ops.mphdrr.show_in_perspective(planes=5, uniform=uniform) == {"FINISHED"}
     (frustum,) = frustums.frustums(scene)
     assert frustum.name == "Perspective 03" and frustum.parent.name == "Module 03" and bpy.context.object == shown
-    bpy.context.view_layer.update()
+    update()
     g = grid_of(shown, ring_system, 2, 5, uniform.lower())  # the real detector's pixels are on the same rays, but
     turned = slice(None, None, -1 if detector == "REAL" else 1)  # the other way round
     means = mph.to_perspective(volumes.volume_from_object(shown), g)
@@ -142,15 +144,15 @@ def test_it_goes_with_its_module_and_says_what_is_not_true_any_more(shown, scene
     (frustum,) = frustums.frustums(scene)
     assert frustums.changes(scene, frustum) == ""
     camera = frustum.parent
-    bpy.context.view_layer.update()
+    update()
     before = [np.linalg.inv(np.array(camera.matrix_world)) @ np.array(o.matrix_world) for o in frustums.layers(frustum)]
     camera.location.z += 20.0
-    bpy.context.view_layer.update()
+    update()
     after = [np.linalg.inv(np.array(camera.matrix_world)) @ np.array(o.matrix_world) for o in frustums.layers(frustum)]
     np.testing.assert_allclose(after, before, atol=1e-3)
     assert frustums.changes(scene, frustum) == "Module 03 has moved, or has other pixels"
     camera.location.z -= 20.0
-    bpy.context.view_layer.update()
+    update()
     assert frustums.changes(scene, frustum) == ""
     scene.mphdrr_projections.width = 30
     assert "other pixels" in frustums.changes(scene, frustum)
@@ -160,7 +162,7 @@ def test_it_goes_with_its_module_and_says_what_is_not_true_any_more(shown, scene
     assert frustums.visible_volumes(scene) == []
     assert frustums.changes(scene, frustum) == "other colours of Derenzo"
     shown.location.x += 4.0
-    bpy.context.view_layer.update()
+    update()
     assert frustums.changes(scene, frustum) == "other place and colours of Derenzo"
     bpy.ops.mphdrr.show_in_perspective(planes=3)
     (frustum,) = frustums.frustums(scene)
@@ -173,11 +175,11 @@ def test_a_module_that_is_turned_away_has_its_frustum_where_its_views_are(shown,
     camera = choose(3)
     camera.rotation_euler.y += 0.05
     camera.rotation_euler.z -= 0.04
-    bpy.context.view_layer.update()
+    update()
     bpy.ops.mphdrr.show_in_perspective(planes=2)
     (frustum,) = frustums.frustums(scene)
     assert frustum.parent == camera
-    bpy.context.view_layer.update()
+    update()
     tilted = scanner.read_scanner(scanner.active_scanner(scene))
     assert np.linalg.norm(tilted.tilt[2]) > 0.03
     g = grid_of(shown, tilted, 2, 2, "k")
@@ -206,10 +208,10 @@ def test_it_is_hidden_and_removed_with_its_module(shown, scene):
     bpy.ops.mphdrr.show_in_perspective(planes=2)
     (frustum,) = frustums.frustums(scene)
     scanner.set_visible(frustum.parent, False)
-    bpy.context.view_layer.update()
+    update()
     assert frustum.hide_viewport and all(layer.hide_viewport for layer in frustum.children)
     scanner.set_visible(frustum.parent, True)
-    bpy.context.view_layer.update()
+    update()
     assert not frustum.hide_viewport and not any(layer.hide_viewport for layer in frustum.children)
     camera = frustum.parent
     module_edits.remove_modules(scanner.active_scanner(scene), [camera])
@@ -224,7 +226,7 @@ def test_it_is_hidden_where_its_modules_camera_was_deleted(shown, scene):
     bpy.ops.mphdrr.show_in_perspective(planes=2)
     (frustum,) = frustums.frustums(scene)
     bpy.data.objects.remove(frustum.parent)
-    bpy.context.view_layer.update()
+    update()
     assert frustums.changes(scene, frustum) == "its module is gone"
     frustums.after_update(scene, type("Updated", (), {"id_type_updated": lambda self, kind: True})())
     assert frustum.hide_viewport and all(layer.hide_viewport for layer in frustum.children)
@@ -234,19 +236,18 @@ def test_it_is_hidden_where_its_modules_camera_was_deleted(shown, scene):
 
 def test_what_cannot_be_shown_is_refused_in_a_line(shown, scene):
     shown.location = 2 * choose(3).location
-    bpy.context.view_layer.update()
-    with pytest.raises(RuntimeError, match="'Derenzo' is not in front of the pinhole of Module 03"):
-        bpy.ops.mphdrr.show_in_perspective()
+    update()
+    refused(bpy.ops.mphdrr.show_in_perspective, "'Derenzo' is not in front of the pinhole of Module 03")
     bpy.context.view_layer.objects.active = None
     assert not bpy.ops.mphdrr.show_in_perspective.poll() and not bpy.ops.mphdrr.resample_in_perspective.poll()
 
 
 def test_a_volume_around_the_pinhole_begins_a_little_before_it(shown, scene):
     shown.scale = (6.0, 6.0, 6.0)
-    bpy.context.view_layer.update()
+    update()
     bpy.ops.mphdrr.show_in_perspective(planes=4, uniform="DEPTH")
     (frustum,) = frustums.frustums(scene)
-    bpy.context.view_layer.update()
+    update()
     source = np.array(frustum.parent.matrix_world)[:3, 3]
     depths = [-np.array(layer.matrix_basis)[2, 3] for layer in frustums.layers(frustum)]
     assert depths[0] > 0.1 * np.linalg.norm(source) and np.all(np.diff(depths) > 0)
@@ -282,8 +283,7 @@ def test_undo_takes_it_back_and_redo_shows_it_again(shown, scene):
 def test_a_saved_file_opens_with_it(shown, scene, tmp_path):
     bpy.ops.mphdrr.show_in_perspective(planes=2)
     pixels = list(frustums.layers(frustums.frustums(scene)[0])[1].data.pixels)
-    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "a.blend"))
-    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "a.blend"))
+    reopened(tmp_path / "a.blend")
     (frustum,) = frustums.frustums(bpy.context.scene)
     assert list(frustums.layers(frustum)[1].data.pixels) == pixels and max(pixels) > 0
     assert frustums.changes(bpy.context.scene, frustum) == ""

@@ -1,4 +1,4 @@
-"""Scene to workbook: the written workbook agrees with the scene, which then counts as saved."""
+"""Scene to workbook and to other programs: what is written agrees with the scene, which then counts as saved."""
 
 from __future__ import annotations
 
@@ -14,8 +14,10 @@ from mphdrr.addon.blender import jobs
 from mphdrr.addon.scanner import module_edits, scanner
 from mphdrr.addon.scanner.scanner_files import export_workbook_job
 from mphdrr.core.errors import InputError, InputWarning
-from mphdrr.core.geometry.system import LENGTHS
+from mphdrr.core.exchange import FORMATS, read_geometry
 from mphdrr.core.workbook import read_system
+
+from .conftest import assert_same, refused, update
 
 
 @pytest.fixture
@@ -27,12 +29,6 @@ def own(small_workbook, tmp_path) -> Path:
 def collection(scene, own):
     bpy.ops.mphdrr.import_geometry(filepath=str(own))
     return scanner.active_scanner(scene)
-
-
-def assert_equal(one, other) -> None:
-    assert one.numbers.tolist() == other.numbers.tolist()
-    for name in ("centers", "tilt", *LENGTHS):
-        assert np.allclose(getattr(one, name), getattr(other, name), rtol=1e-9, atol=1e-9), name
 
 
 def test_unchanged_scanner_writes_the_same_file(scene, workbook, tmp_path):
@@ -64,7 +60,7 @@ def random_edits(rng: np.random.Generator, collection: bpy.types.Collection) -> 
                 module_edits.remove_modules(collection, [camera])
             case 6:
                 module.detector_side, module.detector_thickness = rng.uniform(40.0, 60.0), rng.uniform(5.0, 12.0)
-        bpy.context.view_layer.update()
+        update()
 
 
 @pytest.mark.parametrize(("seed", "use_template"), [(0, True), (2, False)])
@@ -77,12 +73,12 @@ def test_random_edits_come_back_from_the_workbook(scene, collection, tmp_path, s
             system = scanner.read_scanner(collection)
             path = tmp_path / f"{turn}.xlsx"
             bpy.ops.mphdrr.export_geometry(filepath=str(path), use_template=use_template)
-            assert_equal(read_system(path), system)
-            assert_equal(scanner.read_scanner(collection), system)
+            assert_same(read_system(path), system, 1e-9)
+            assert_same(scanner.read_scanner(collection), system, 1e-9)
             assert scanner.losses(collection) == []
             assert scanner.read_scanner(collection).source.path == path
     bpy.ops.mphdrr.import_geometry(filepath=str(path), name=collection.mphdrr_scanner.scanner_name)
-    assert_equal(scanner.read_scanner(collection), system)
+    assert_same(scanner.read_scanner(collection), system, 1e-9)
 
 
 def test_modules_keep_the_order_of_the_workbook_and_added_ones_come_last(collection, tmp_path):
@@ -97,11 +93,11 @@ def test_a_turned_camera_is_a_tilted_module_in_the_workbook(collection, own, tmp
     scanner.module(collection, 7).rotation_euler.y += 0.1
     bpy.ops.mphdrr.export_geometry(filepath=str(own), use_template=False)
     tilted = read_system(own)
-    assert_equal(tilted, scanner.read_scanner(collection))
+    assert_same(tilted, scanner.read_scanner(collection), 1e-9)
     assert np.flatnonzero(np.any(tilted.tilt, axis=1)).tolist() == [6]
     bpy.ops.mphdrr.aim_modules()
     bpy.ops.mphdrr.export_geometry(filepath=str(own))
-    assert_equal(read_system(own), scanner.read_scanner(collection))
+    assert_same(read_system(own), scanner.read_scanner(collection), 1e-9)
 
 
 def test_moved_and_exported_at_once(collection, tmp_path):
@@ -109,7 +105,7 @@ def test_moved_and_exported_at_once(collection, tmp_path):
     scanner.module(collection, 12).location.z += 2.5
     bpy.ops.mphdrr.export_geometry(filepath=str(tmp_path / "moved.xlsx"))
     moved = read_system(tmp_path / "moved.xlsx")
-    assert_equal(moved, scanner.read_scanner(collection))
+    assert_same(moved, scanner.read_scanner(collection), 1e-9)
     assert moved.centers[11, 2] == pytest.approx(read_system(tmp_path / "own.xlsx").centers[11, 2] + 2.5, abs=1e-5)
 
 
@@ -119,24 +115,42 @@ def test_template_that_has_gone_is_said(collection, own, tmp_path):
     system = scanner.read_scanner(collection)
     with pytest.warns(InputWarning, match=r"own\.xlsx has gone"):
         jobs.run(export_workbook_job(collection, tmp_path / "new.xlsx"))
-    assert_equal(read_system(tmp_path / "new.xlsx"), system)
+    assert_same(read_system(tmp_path / "new.xlsx"), system, 1e-9)
 
 
-@pytest.mark.parametrize("name", ["", "no/such/folder.xlsx", "wrong.ods"])
-def test_bad_paths_are_one_line_and_leave_the_scanner(collection, own, tmp_path, name):
+def test_bad_paths_are_one_line_and_leave_the_scanner(collection, tmp_path):
     source = collection.mphdrr_scanner.source
-    with pytest.raises(RuntimeError) as error:
-        bpy.ops.mphdrr.export_geometry(filepath=str(tmp_path / name) if name else "")
-    assert "Traceback" not in str(error.value) and len(str(error.value).strip().splitlines()) == 1
+    for name in ("", "no/such/folder.xlsx", "wrong.ods"):
+        refused(bpy.ops.mphdrr.export_geometry, "", filepath=str(tmp_path / name) if name else "")
     assert collection.mphdrr_scanner.source == source
 
 
 def test_changed_scanner_can_be_read_again_after_saving(scene, collection, tmp_path):
     scanner.module(collection, 9).location.x += 4.0
-    bpy.context.view_layer.update()
+    update()
     with pytest.raises(InputError, match="module 9 moved"):
         scanner.build_scanner(scene, read_system(tmp_path / "own.xlsx"), "own")
     path = tmp_path / "saved.xlsx"
     bpy.ops.mphdrr.export_geometry(filepath=str(path))
     scanner.build_scanner(scene, read_system(path), "own")
-    assert_equal(scanner.read_scanner(collection), read_system(path))
+    assert_same(scanner.read_scanner(collection), read_system(path), 1e-9)
+
+
+def test_every_format_of_other_programs_is_written(imported, tmp_path):
+    for name, format in FORMATS.items():
+        path = tmp_path / f"{name}{(format.suffixes or ('',))[0]}"
+        assert bpy.ops.mphdrr.export_for_program(format=name, filepath=str(path)) == {"FINISHED"}
+        files = list(path.iterdir()) if path.is_dir() else [path]
+        assert files and all(file.stat().st_size > 0 for file in files)
+
+
+def test_other_programs_get_the_scene_as_it_stands_with_its_tilted_modules(imported, scene, tmp_path):
+    scanner.module(imported, 3).location[0] += 5.0
+    scanner.module(imported, 7).rotation_euler[1] += 0.1
+    scene.mphdrr_projections.width, scene.mphdrr_projections.height = 40, 30
+    path = tmp_path / "record.json"
+    bpy.ops.mphdrr.export_for_program(format="mphdrr", filepath=str(path))
+    (system, views), expected = read_geometry(path), scanner.read_scanner(imported)
+    assert np.array_equal(system.centers, expected.centers) and views.shape == (30, 40)
+    assert np.array_equal(system.tilt, expected.tilt) and np.flatnonzero(np.any(system.tilt, axis=1)).tolist() == [6]
+    assert np.linalg.norm(system.tilt[6]) == pytest.approx(0.1, abs=0.05)

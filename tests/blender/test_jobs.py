@@ -21,6 +21,8 @@ from mphdrr.core.runs.recipe import Recipe
 from mphdrr.core.volumes.volume import Volume
 from mphdrr.core.volumes.volume_files import write_volume
 
+from .conftest import refused, reopened
+
 
 @pytest.fixture
 def scanned(scene, ring_system):
@@ -204,8 +206,7 @@ def test_jobs_wait_for_each_other_and_are_cancelled_one_by_one():
     assert b.tick() == {"PASS_THROUGH"} and c.tick("ESC") == {"PASS_THROUGH"}, "Esc is for the running one"
     bpy.ops.mphdrr.cancel_job(number=b._run.number)
     assert b.tick() == {"CANCELLED"} and discarded == ["b"] and a._run.is_alive()
-    with pytest.raises(RuntimeError, match="another job is running"):
-        bpy.ops.mphdrr.add_derenzo(voxels=8)
+    refused(bpy.ops.mphdrr.add_derenzo, "another job is running", voxels=8)
     go_on.append("a")
     a._run.join(5)
     assert c.tick() == {"PASS_THROUGH"} and not c._run.is_alive()
@@ -274,8 +275,7 @@ def test_exact_numbers_take_no_memory_until_they_are_looked_at(scanned):
     assert not image.has_data and image.packed_file.size < 16 * 10 * 12
     numbers = images.projection_array(image)
     assert not image.has_data and numbers.max() > 0
-    bpy.ops.wm.save_as_mainfile(filepath=f"{bpy.app.tempdir}/run.blend")
-    bpy.ops.wm.open_mainfile(filepath=f"{bpy.app.tempdir}/run.blend")
+    reopened(f"{bpy.app.tempdir}/run.blend")
     assert np.array_equal(images.projection_array(bpy.data.images[ids.projection_name(1, 8)]), numbers)
     assert volumes.volume_objects(bpy.context.scene)
 

@@ -1,4 +1,4 @@
-"""Looks of volumes: surfaces, cuts in front of slices, colours that tell things apart."""
+"""Looks of volumes (surfaces, cuts in front of slices, colours that tell things apart), and maps of the scanner."""
 
 from __future__ import annotations
 
@@ -9,13 +9,19 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
+from mphdrr.addon.blender import jobs
 from mphdrr.addon.perspective import color_bar
+from mphdrr.addon.scanner import maps, scanner
 from mphdrr.addon.volumes import looks, slices, volume_materials, volumes
 from mphdrr.core.geometry.grid import Grid
 from mphdrr.core.geometry.part_colors import LOOKS
 from mphdrr.core.physics.ct_numbers import hu_to_mu
+from mphdrr.core.physics.maps import sensitivity_map
 from mphdrr.core.physics.materials import attenuation
+from mphdrr.core.physics.performance import sensitivity
 from mphdrr.core.volumes.volume import Volume
+
+from .conftest import refused, reopened, update
 
 
 @pytest.fixture
@@ -27,7 +33,7 @@ def nema(scene):
 def surface(item) -> tuple[np.ndarray, np.ndarray]:
     """Vertices (n, 3) in the object's space and edges (m, 2) of the surface that Blender draws."""
     made = looks.surface_of(item)
-    bpy.context.view_layer.update()
+    update()
     mesh = made.evaluated_get(bpy.context.evaluated_depsgraph_get()).data
     vertices = np.array([made.matrix_local @ vertex.co for vertex in mesh.vertices]).reshape(-1, 3)
     return vertices, np.array([edge.vertices for edge in mesh.edges]).reshape(-1, 2)
@@ -87,7 +93,7 @@ def test_a_look_from_the_asset_library_restyles_a_volume_and_its_slices(nema, tm
     look = nema.data.materials[0].node_tree.nodes["Look"]
 
     def brightest() -> np.ndarray:
-        bpy.context.view_layer.update()
+        update()
         pixels = np.array(plane.data.materials[0].node_tree.nodes["Slice"].image.pixels).reshape(-1, 4)
         return pixels[pixels[:, :3].sum(axis=1).argmax(), :3]
 
@@ -97,7 +103,7 @@ def test_a_look_from_the_asset_library_restyles_a_volume_and_its_slices(nema, tm
     assert np.allclose(brightest(), 1.0, atol=0.01)
     own, other = plane.material_slots[0].material, volume_materials.new_material("Other", "mu", 9.0)
     plane.material_slots[0].material = other  # a drop on a slice is meant for the volume
-    bpy.context.view_layer.update()
+    update()
     assert nema.data.materials[0] == other and plane.material_slots[0].material == own
     assert nema.data.materials[0].node_tree.nodes["Values"].attribute_name == "activity"
 
@@ -148,8 +154,7 @@ def test_slices_of_nema_show_six_spheres_also_after_reopening(nema, tmp_path):
     nema.mphdrr_volume.display_low = 6.0  # above the background
     at = np.linalg.inv(slices._read_volume(nema).grid.affine) @ [0, 0, 0, 1]  # the spheres' middles
     nema.mphdrr_volume.slices = np.rint(at[:3]).astype(int).tolist()
-    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "a.blend"))
-    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "a.blend"))
+    reopened(tmp_path / "a.blend")
     image = slices.planes_of(bpy.data.objects["NEMA Body"])[2].data.materials[0].node_tree.nodes["Slice"].image
     pixels = np.array(image.pixels).reshape(image.size[1], image.size[0], 4)
     assert ndimage.label(pixels[..., 3] > 0)[1] == 6
@@ -186,8 +191,7 @@ def test_a_map_of_an_older_file_is_shown_in_the_same_unit(scene, tmp_path):
     settings.unit = "counts/decay"
     for name in ("minimum", "maximum", "display_low", "display_high"):
         setattr(settings, name, 1e-6 * getattr(settings, name))
-    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "a.blend"))
-    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "a.blend"))
+    reopened(tmp_path / "a.blend")
     settings = bpy.data.objects["Map"].mphdrr_volume
     assert settings.unit == "cps/MBq" and settings.display_high == pytest.approx(shown) == pytest.approx(200.0)
 
@@ -211,3 +215,80 @@ def test_crystals_phantoms_maps_and_the_selection_share_no_hue(scene):
         for other, two in found.items():
             apart = np.abs((one[:, None] - two + 180) % 360 - 180).min()
             assert name == other or apart > 12, f"{name} and {other}: {apart:.0f} degrees of hue apart"
+
+
+def the_map(quantity="sensitivity"):
+    (item,) = [o for o in volumes.volume_objects(bpy.context.scene) if o.mphdrr_volume.quantity == quantity]
+    return item
+
+
+def test_map_is_the_cores_within_the_roi(imported):
+    assert bpy.ops.mphdrr.add_map(quantity="sensitivity", voxels=12) == {"FINISHED"}
+    volume = volumes.volume_from_object(the_map())
+    system = scanner.read_scanner(imported)
+    expected = sensitivity_map(system, volume.grid).array
+    corners = np.stack(np.meshgrid(*map(np.arange, volume.grid.shape), indexing="ij"), axis=-1)
+    places = corners @ volume.grid.affine[:3, :3].T + volume.grid.affine[:3, 3]
+    inside = np.linalg.norm(places, axis=-1) <= system.roi_radius.max()
+    assert np.array_equal(volume.array, np.where(inside, expected, 0))
+    assert the_map().mphdrr_volume.unit == "cps/MBq"
+
+
+def test_map_follows_the_scanner_and_is_replaced(imported):
+    bpy.ops.mphdrr.add_map(quantity="sensitivity", voxels=5, within_roi=False)
+    before = volumes.volume_from_object(the_map())
+    module = scanner.module(imported, 1).mphdrr_module
+    module.pinhole_diameter = 4.0
+    bpy.ops.mphdrr.add_map(quantity="sensitivity", voxels=5, within_roi=False)
+    after = volumes.volume_from_object(the_map())
+    middle = np.zeros((1, 3))
+    gained = sensitivity(scanner.read_scanner(imported), middle)[0, 0] * (1 - (2.3 / 4.0) ** 2)
+    assert after.array[2, 2, 2] - before.array[2, 2, 2] == pytest.approx(gained, rel=1e-4)
+
+
+def test_each_scanner_has_its_own_map_and_no_other_volume_is_replaced(imported, scene, small_workbook):
+    volumes.add_volume(Volume(np.ones((3, 3, 3)), Grid.centered(3, 1.0), "sensitivity"), "Measured")
+    bpy.ops.mphdrr.add_map(quantity="sensitivity", voxels=3, within_roi=False)
+    bpy.ops.mphdrr.import_geometry(filepath=str(small_workbook), name="Other")
+    other = scanner.active_scanner(scene)
+    scanner.module(other, 1).mphdrr_module.pinhole_diameter = 4.6
+    for _ in range(2):
+        bpy.ops.mphdrr.add_map(quantity="sensitivity", voxels=3, within_roi=False)
+    of_other, of_first = (bpy.data.objects[name] for name in ("Sensitivity map.001", "Sensitivity map"))
+    assert len(volumes.volume_objects(scene)) == 3 and np.all(volumes.volume_from_object(of_first).array)
+    ratio = volumes.volume_from_object(of_other).array / volumes.volume_from_object(of_first).array
+    of_modules = sensitivity(scanner.read_scanner(other), np.zeros((1, 3)))[0]
+    assert ratio[1, 1, 1] == pytest.approx(of_modules.sum() / (of_modules.sum() - 0.75 * of_modules[0]), rel=1e-5)
+    before = volumes.volume_from_object(of_first).array
+    jobs.run(maps.remake_map_job(scene, of_first))  # while the other scanner is active
+    assert np.array_equal(volumes.volume_from_object(of_first).array, before)
+
+
+def test_maps_are_not_projected(imported):
+    bpy.ops.mphdrr.add_map(quantity="modules", voxels=4)
+    refused(bpy.ops.mphdrr.render_projections, "no volume of activity or mu in the scene", width=4, height=4)
+    bpy.ops.mphdrr.add_derenzo(voxels=16, rod_diameters=(10, 8, 0, 0, 0, 0))
+    assert bpy.ops.mphdrr.render_projections(width=4, height=4) == {"FINISHED"}
+
+
+def test_a_maps_surface_is_at_a_value_of_the_windows_unit(imported):
+    bpy.ops.mphdrr.add_map(quantity="sensitivity", voxels=12, within_roi=False)
+    item = the_map()
+    bpy.context.view_layer.objects.active = item
+    settings = item.mphdrr_volume
+    level = 0.7 * settings.maximum
+    assert level > 100, "cps/MBq"
+    assert bpy.ops.mphdrr.mesh_from_volume(level=level) == {"FINISHED"}
+    mesh = bpy.data.meshes[f"{item.name} surface"]
+    system = scanner.read_scanner(imported)
+    places = np.array([vertex.co for vertex in mesh.vertices])
+    values = 1e6 * sensitivity(system, places).sum(axis=1)
+    assert np.median(values) == pytest.approx(level, rel=0.1)
+
+
+@pytest.mark.parametrize("quantity", ["modules", "resolution", "completeness"])
+def test_other_maps(imported, quantity):
+    assert bpy.ops.mphdrr.add_map(quantity=quantity, voxels=4, side=20) == {"FINISHED"}
+    low, high = {"modules": (16, 16), "resolution": (5, 20), "completeness": (0.8, 1.0)}[quantity]
+    values = volumes.volume_from_object(the_map(quantity)).array
+    assert values.min() >= low and values.max() <= high

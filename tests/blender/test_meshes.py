@@ -10,12 +10,14 @@ import pytest
 
 from mphdrr.addon.volumes import volumes
 
+from .conftest import refused, update
+
 
 def select(*items):
     for item in bpy.context.scene.objects:
         item.select_set(item in items)
     bpy.context.view_layer.objects.active = items[0]
-    bpy.context.view_layer.update()
+    update()
 
 
 def added():
@@ -81,16 +83,14 @@ def test_open_mesh_is_named_with_the_place():
     bpy.ops.mesh.primitive_plane_add(size=10.0, location=(0, 0, 5))
     bpy.context.object.name = "lid"
     select(bpy.context.object)
-    with pytest.raises(RuntimeError, match=r"'lid': .*not closed at 4 edges"):
-        bpy.ops.mphdrr.voxelize_objects()
+    refused(bpy.ops.mphdrr.voxelize_objects, r"'lid': .*not closed at 4 edges")
     assert not volumes.volume_objects(bpy.context.scene)
 
 
 def test_scanner_parts_are_not_voxelized(workbook):
     bpy.ops.mphdrr.import_geometry(filepath=str(workbook))
     select(*[o for o in bpy.context.scene.objects if o.type == "MESH"])
-    with pytest.raises(RuntimeError, match="Select closed mesh"):
-        bpy.ops.mphdrr.voxelize_objects()
+    refused(bpy.ops.mphdrr.voxelize_objects, "Select closed mesh")
 
 
 @pytest.mark.long

@@ -14,6 +14,7 @@ from mphdrr.addon.blender import jobs
 from mphdrr.addon.scanner import optimising, scanner
 from mphdrr.core.cli import main
 
+from .conftest import refused, update
 from .test_jobs import everything
 
 pytest.importorskip("scipy", reason="no scipy")
@@ -139,7 +140,7 @@ def test_it_moves_while_it_works_and_cancelling_takes_all_back(scene, recipe, li
     scene.render.resolution_x, scene.camera = 777, None
     if has != "none":
         scanner.build_scanner(scene, like if has == "these modules" else ring_system, "Mine")
-    bpy.context.view_layer.update()
+    update()
     before = everything()
     job, seen = moved(scene, recipe, 14)
     steps = {system.pinhole_diameter[0] for system in seen if system is not None}
@@ -186,9 +187,7 @@ def test_faults_are_said_and_marked(scene, recipe, tmp_path):
 def test_one_line_says_what_is_wrong(scene, recipe, tmp_path, monkeypatch):
     (tmp_path / "bad.toml").write_text(TEXT.replace('"detail"', '"beauty"'))
     for path, said in (("", "no file given: set filepath to a design"), (tmp_path / "bad.toml", "kind 'beauty'")):
-        with pytest.raises(RuntimeError, match=said):
-            bpy.ops.mphdrr.optimise(filepath=str(path))
+        refused(bpy.ops.mphdrr.optimise, said, filepath=str(path))
     monkeypatch.setitem(sys.modules, "scipy.optimize", None)
-    with pytest.raises(RuntimeError, match=r"scipy is missing: pip install \"mphdrr\[design\]\""):
-        bpy.ops.mphdrr.optimise(filepath=str(recipe))
+    refused(bpy.ops.mphdrr.optimise, r"scipy is missing: pip install \"mphdrr\[design\]\"", filepath=str(recipe))
     assert not scanner.scanners(scene)

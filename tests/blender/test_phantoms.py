@@ -1,4 +1,4 @@
-"""Phantoms in the scene: every kind equals core's, follows its settings and its object, and can be baked."""
+"""Phantoms in the scene: every kind equals core's and follows its settings, at once, at rest or on Update."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from mathutils import Matrix
 
-from mphdrr.addon.blender import jobs, objects
-from mphdrr.addon.phantoms import phantom_properties, phantoms
-from mphdrr.addon.volumes import volumes
+from mphdrr.addon.blender import jobs, objects, storage, windows
+from mphdrr.addon.phantoms import live_phantoms, phantom_properties, phantoms
+from mphdrr.addon.volumes import slices, volumes
 from mphdrr.core.errors import InputError
 from mphdrr.core.geometry.frames import euler_pose
 from mphdrr.core.geometry.grid import Grid
@@ -21,6 +21,8 @@ from mphdrr.core.phantoms.language import read_phantom
 from mphdrr.core.phantoms.phantom import Phantom
 from mphdrr.core.projector import Projector
 from mphdrr.core.volumes.volume import Volume
+
+from .conftest import refused, reopened
 
 THORAX = Path(__file__).parents[2] / "examples" / "phantoms" / "thorax.toml"
 POSE = {"location": (4.0, -5.0, 6.0), "phi": 0.5, "theta": 0.25, "psi": -0.125}  # whole in float32
@@ -110,16 +112,13 @@ def test_settings_that_cannot_be_leave_the_voxels_and_say_why():
     settings.spacing = 1.0
     assert "disk thickness" in item.mphdrr_volume.message and item.mphdrr_volume.outdated
     assert np.array_equal(voxels_of(item), before)
-    with pytest.raises(RuntimeError, match="disk thickness"):
-        bpy.ops.mphdrr.update_phantom()
+    refused(bpy.ops.mphdrr.update_phantom, "disk thickness")
     assert np.array_equal(voxels_of(item), before)
     settings.spacing = 9.0
     assert not item.mphdrr_volume.message and not np.array_equal(voxels_of(item), before)
     objects = len(bpy.data.objects), len(bpy.data.volumes)
-    with pytest.raises(RuntimeError, match="defect from"):
-        bpy.ops.mphdrr.add_torso(defect_from=0.9)
-    with pytest.raises(RuntimeError, match="grid of points has no mu"):
-        bpy.ops.mphdrr.add_points(voxels=8, attenuation=True)
+    refused(bpy.ops.mphdrr.add_torso, "defect from", defect_from=0.9)
+    refused(bpy.ops.mphdrr.add_points, "grid of points has no mu", voxels=8, attenuation=True)
     assert (len(bpy.data.objects), len(bpy.data.volumes)) == objects
     item = add("points", voxels=12)
     item.mphdrr_volume.points.quantity = "mu"
@@ -128,8 +127,7 @@ def test_settings_that_cannot_be_leave_the_voxels_and_say_why():
 
 def test_settings_survive_saving_and_copies_follow_their_own(tmp_path):
     add("shepp-logan", voxels=8, activity=3, **POSE)
-    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "a.blend"))
-    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "a.blend"))
+    reopened(tmp_path / "a.blend")
     item = bpy.data.objects["Shepp-Logan Head"]
     copy = item.copy()
     bpy.context.collection.objects.link(copy)
@@ -152,8 +150,7 @@ def test_toml_becomes_a_text_that_the_phantom_follows(tmp_path):
     assert bpy.ops.mphdrr.update_phantom() == {"FINISHED"}
     assert total(volumes.volume_from_object(item)) == pytest.approx(16 / 3 * np.pi, rel=1e-3)
     text.from_string('[[shape]]\nkind = "sphere"\n')
-    with pytest.raises(RuntimeError, match=r"thorax.toml: shape 1: radius: missing"):
-        bpy.ops.mphdrr.update_phantom()
+    refused(bpy.ops.mphdrr.update_phantom, r"thorax.toml: shape 1: radius: missing")
     item.mphdrr_volume.file.text = None
     assert "no text is chosen" in item.mphdrr_volume.message
 
@@ -167,8 +164,7 @@ def test_toml_that_is_no_phantom_adds_nothing(text, message, tmp_path):
     if text is not None:
         file.write_text(text)
     before = len(bpy.data.objects), len(bpy.data.texts)
-    with pytest.raises(RuntimeError, match=rf"a\.toml.*{message}"):
-        bpy.ops.mphdrr.import_phantom(filepath=str(file))
+    refused(bpy.ops.mphdrr.import_phantom, rf"a\.toml.*{message}", filepath=str(file))
     assert (len(bpy.data.objects), len(bpy.data.texts)) == before
 
 
@@ -224,3 +220,133 @@ def test_outline_goes_with_the_phantom_and_its_settings():
     meshes = len(bpy.data.meshes)
     assert bpy.ops.mphdrr.show_phantom_outline() == {"FINISHED"}
     assert phantoms.outline_of(item) is None and len(bpy.data.meshes) == meshes - 1
+
+
+@pytest.fixture
+def item():
+    """A phantom of two quantities, 12^3 voxels."""
+    bpy.ops.mphdrr.add_shepp_logan(voxels=12, half_size=40, attenuation=True, location=(3, 4, 5))
+    return bpy.context.object
+
+
+@pytest.fixture
+def window(monkeypatch):
+    """A window in which every phantom is too large to be made at every edit."""
+    monkeypatch.setattr(windows, "has_window", lambda: True)
+    monkeypatch.setattr(live_phantoms, "QUICK_VOXELS", 0)
+
+
+def is_waiting() -> bool:
+    return bpy.app.timers.is_registered(live_phantoms._update_edited)
+
+
+def assert_made(item) -> None:
+    """The voxels of every quantity follow from the settings and the object's pose."""
+    recipe = phantoms.copy_settings(phantoms.settings_of(item))
+    for one in phantoms.with_children(item):
+        volume = volumes.volume_from_object(one)
+        assert np.array_equal(volume.array, recipe.phantom.voxelize(recipe.grid, quantity=volume.quantity).array)
+        np.testing.assert_allclose(volume.grid.affine, volumes.pose_of_object(one) @ recipe.grid.affine, atol=1e-5)
+    assert not item.mphdrr_volume.outdated and not item.mphdrr_volume.message
+
+
+def test_a_small_phantom_follows_every_edit(item):
+    data, settings = item.data, item.mphdrr_volume.shepp_logan
+    look = data.materials[0].node_tree.nodes["Look"].inputs
+    look["Density"].default_value *= 3
+    density, planes = look["Density"].default_value, slices.add_slices(item)
+    settings.half_size = 44
+    assert_made(item)
+    assert item.data == data, "in place: what was set on it stays"
+    assert look["Density"].default_value == density, "as opaque as before: the opacity per mm follows the size"
+    assert look["Size"].default_value == pytest.approx(item.mphdrr_volume.extent)
+    assert slices.planes_of(item) and slices.planes_of(item) != planes
+    assert not is_waiting()
+
+
+def test_a_larger_one_is_made_when_its_settings_rest(item, window):
+    settings, before = item.mphdrr_volume.shepp_logan, volumes.volume_from_object(item)
+    for half_size in (44, 48):
+        settings.half_size = half_size
+        assert item.mphdrr_volume.outdated and is_waiting()
+        assert np.array_equal(volumes.volume_from_object(item).array, before.array)
+    assert live_phantoms._update_edited() is None
+    assert_made(item)
+
+
+def test_the_largest_wait_for_update_and_nobody_takes_old_voxels_for_new(item, window, monkeypatch, tmp_path):
+    monkeypatch.setattr(live_phantoms, "RESTED_VOXELS", 1000)
+    item.mphdrr_volume.shepp_logan.activity = 11
+    assert not is_waiting()
+    for one in phantoms.with_children(item):
+        with pytest.raises(InputError, match="press Update Phantom first"):
+            phantoms.require_current(one)
+    refused(bpy.ops.mphdrr.export_volume, "press Update Phantom first", filepath=str(tmp_path / "a.vdb"))
+    assert bpy.ops.mphdrr.update_phantom() == {"FINISHED"}
+    assert_made(item)
+
+
+def test_what_cannot_be_made_is_said_and_not_tried_again(item, window, monkeypatch):
+    settings = item.mphdrr_volume.shepp_logan
+    item.scale.x = 0
+    settings.half_size = 35
+    assert "cannot be inverted" in item.mphdrr_volume.message and item.mphdrr_volume.outdated and not is_waiting()
+    item.scale.x = 1
+    settings.half_size = 32
+    assert not item.mphdrr_volume.message and is_waiting()
+    bpy.data.objects.remove(item)
+    assert live_phantoms._update_edited() is None
+
+
+def test_an_undo_takes_back_voxels_and_settings_together(item):
+    name = item.name
+    bpy.ops.ed.undo_push(message="added")
+    item.mphdrr_volume.shepp_logan.half_size = 30
+    bpy.ops.ed.undo_push(message="changed")
+    for step, half_size in ((bpy.ops.ed.undo, 40), (bpy.ops.ed.redo, 30)):
+        assert step() == {"FINISHED"}
+        item = bpy.data.objects[name]
+        assert item.mphdrr_volume.shepp_logan.half_size == half_size
+        assert_made(item)
+
+
+def test_a_volume_that_goes_while_voxels_are_made(item):
+    stored = phantoms.make_voxelizer(item)(None)
+    bpy.data.objects.remove(item.children[0])
+    with pytest.raises(InputError, match="try again"):
+        phantoms.replace_voxels(item, stored)
+
+
+def test_a_setting_that_changes_while_an_update_is_made(item, window, monkeypatch):
+    remaking, settings = phantoms.make_voxelizer, item.mphdrr_volume.shepp_logan
+
+    def edited_meanwhile(*arguments):
+        work = remaking(*arguments)
+
+        def working(progress):
+            made = work(progress)
+            settings.half_size = 55
+            return made
+
+        return working
+
+    monkeypatch.setattr(phantoms, "make_voxelizer", edited_meanwhile)
+    assert bpy.ops.mphdrr.update_phantom() == {"FINISHED"}
+    assert item.mphdrr_volume.outdated and is_waiting()
+    monkeypatch.undo()
+    assert bpy.ops.mphdrr.update_phantom() == {"FINISHED"}
+    assert_made(item)
+
+
+def test_panels_look_at_the_disk_now_and_then(item, monkeypatch):
+    monkeypatch.setattr(storage, "_SIZE_LIFETIME", 1e9)
+    path = volumes.file_of(item)
+    assert "KiB" in volumes.file_note(item) and storage.missing_volumes() == []
+    content = path.read_bytes()
+    path.unlink()
+    assert "KiB" in volumes.file_note(item) and storage.missing_volumes() == []
+    storage._cached_size.cache_clear()
+    assert volumes.file_note(item) == "missing" and storage.missing_volumes() == [item.data]
+    path.write_bytes(content)
+    storage._cached_size.cache_clear()
+    assert "KiB" in volumes.file_note(item)

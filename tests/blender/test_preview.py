@@ -16,6 +16,8 @@ from mphdrr.core.geometry.grid import Grid
 from mphdrr.core.projector import Emission, Projector
 from mphdrr.core.volumes.volume import Volume
 
+from .conftest import update
+
 
 @pytest.fixture
 def scanned(scene, ring_system):
@@ -73,7 +75,7 @@ def test_what_moves_is_asked_for_anew_and_voxels_are_read_once(scanned, scene, m
     )
     for edit in edits:
         edit()
-        bpy.context.view_layer.update()
+        update()
         now = preview.read_request(bpy.context)
         assert not now.equals(before)
         preview.make_preview(now, True, voxels)
@@ -94,7 +96,7 @@ def test_the_picture_stands_where_the_modules_plane_does(scanned, scene):
     assert bpy.ops.mphdrr.render_projections(width=40, height=30) == {"FINISHED"}
     scene.mphdrr_projections.width, scene.mphdrr_projections.height = 40, 30
     plane = bpy.data.objects["Projection 03"]
-    bpy.context.view_layer.update()
+    update()
     half = 0.5 * plane.empty_display_size * np.array(plane.data.size) / max(plane.data.size)
     ends = ((-1, 1), (1, 1), (1, -1), (-1, -1))
     corners = [plane.matrix_world @ Vector((x * half[0], y * half[1], 0)) for x, y in ends]
@@ -142,7 +144,7 @@ def test_a_picture_that_takes_long_says_that_it_is_of_before(scanned, scene, mon
     monkeypatch.setattr(preview, "make_preview", lambda *arguments: go_on.wait(60) and make(*arguments))
     monkeypatch.setattr(preview, "_PATIENCE", 0.0)
     bpy.data.objects["Derenzo"].location.x = 7.0
-    bpy.context.view_layer.update()
+    update()
     session.has_changed, session.full_at = True, None
     session.take_turn(bpy.context)
     session.take_turn(bpy.context)

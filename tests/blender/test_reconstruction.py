@@ -1,37 +1,41 @@
-"""The Reconstruction panel and its job: settings, the volume in the scene, updates, Cancel and Finish Now."""
+"""The Reconstruction panel and its jobs: settings, the volume in the scene, Cancel, Finish Now; back-projections."""
 
 from __future__ import annotations
 
 import json
 import shutil
-from unittest.mock import MagicMock
 
 import bpy
 import numpy as np
 import pytest
 
 import mphdrr.core as mph
-from mphdrr.addon import registration
 from mphdrr.addon.blender import ids, jobs, plots, storage, windows
-from mphdrr.addon.reconstruction import reconstructions
-from mphdrr.addon.reconstruction.reconstruction_properties import PROPERTIES, panel_properties, settings_recipe
-from mphdrr.addon.scanner import scanner
+from mphdrr.addon.perspective import color_bar
+from mphdrr.addon.reconstruction import backprojections, reconstructions
+from mphdrr.addon.reconstruction.reconstruction_properties import (
+    PROPERTIES,
+    panel_properties,
+    settings_recipe,
+    voxels_recipe,
+)
 from mphdrr.addon.volumes import slices, volumes
 from mphdrr.core.progress import Cancelled
-from mphdrr.core.reconstruction.methods import METHOD_FILES, METHODS, Method
+from mphdrr.core.reconstruction.method_files import METHOD_FILES
+from mphdrr.core.reconstruction.methods import METHODS, Method
 from mphdrr.core.runs.files import read_run
-from mphdrr.core.runs.run_recipe import truth_of_run
+from mphdrr.core.runs.run_recipe import run_truth
 from mphdrr.core.runs.settings import SETTINGS
 from mphdrr.core.volumes.sights import bright_value, full_slices
+
+from .conftest import Drawn, datablocks, refused
 
 SMALL = {"voxels": 14, "spacing": 7.0, "iterations": 3, "subsets": 2}
 
 
 @pytest.fixture
-def render(scene, ring_system):
+def render(scene, derenzo):
     """A scanner of eight modules, a phantom and a run of counts."""
-    scanner.build_scanner(scene, ring_system, "Ring")
-    bpy.ops.mphdrr.add_derenzo(voxels=32, rod_diameters=(10, 8, 0, 0, 0, 0), location=(5, -3, 2), phi=0.2)
     settings = scene.mphdrr_projections
     settings.width, settings.height, settings.model, settings.time = 12, 10, "EMISSION", 600.0
 
@@ -44,21 +48,27 @@ def render(scene, ring_system):
     return now
 
 
+def shown_run() -> mph.ProjectionRun:
+    return read_run(storage.absolute(bpy.context.scene.mphdrr_projections.run_file))
+
+
+def reconstruction_recipe(**settings) -> mph.Recipe:
+    return mph.Recipe({f"reconstruction.{name}": value for name, value in settings.items()})
+
+
+def voxels_of(item) -> np.ndarray:
+    return volumes.volume_from_object(item).array
+
+
 def reconstructed() -> bpy.types.Object:
     return bpy.context.scene.mphdrr_reconstruction.volume
 
 
 def state() -> tuple:
-    """What a cancelled job leaves as it was."""
-    scene = bpy.context.scene
-    return (
-        sorted(item.name for item in bpy.data.objects),
-        sorted(data.name for data in bpy.data.volumes),
-        sorted(material.name for material in bpy.data.materials),
-        sorted(image.name for image in bpy.data.images),
-        sorted(path.name for path in storage.folder().iterdir()),
-        scene.mphdrr_reconstruction.record,
-    )
+    """Return what a cancelled job leaves as it was."""
+    files = sorted(path.name for path in storage.folder().iterdir())
+    record = bpy.context.scene.mphdrr_reconstruction.record
+    return datablocks("objects", "volumes", "materials", "images"), files, record
 
 
 def test_the_volume_is_that_of_the_command_line(render, scene):
@@ -66,8 +76,8 @@ def test_the_volume_is_that_of_the_command_line(render, scene):
     item = reconstructed()
     assert item.name == f"{scene.mphdrr_projections.runs[0].name} OSEM"
     assert bpy.context.object == item and item.mphdrr_volume.quantity == "activity"
-    run = read_run(storage.absolute(scene.mphdrr_projections.run_file))
-    expected = mph.reconstruct_run(run, mph.Recipe({f"reconstruction.{name}": value for name, value in SMALL.items()}))
+    run = shown_run()
+    expected = mph.reconstruct_run(run, reconstruction_recipe(**SMALL))
     found = volumes.volume_from_object(item)
     np.testing.assert_allclose(found.array, expected.volume.array, rtol=1e-6)
     np.testing.assert_allclose(found.grid.affine, expected.volume.grid.affine, atol=1e-6)
@@ -76,7 +86,7 @@ def test_the_volume_is_that_of_the_command_line(render, scene):
     np.testing.assert_allclose(known["objective"], expected.objective)
     assert [name for name, _ in known["scores"]] == ["NRMSE"] and known["voxels"] == "14 x 14 x 14 voxels of 7 mm"
     assert known["flatters"] == expected.settings["flatters"]
-    rods = mph.score_volume(expected.volume, *truth_of_run(run)).derenzo
+    rods = mph.score_volume(expected.volume, *run_truth(run)).derenzo
     assert [tuple(row) for row in known["rods"]] == [sector.cells for sector in rods if sector.rod_diameter]
     assert bpy.data.objects["Derenzo"].hide_get(), "the truth stands where the reconstruction is"
     planes, at = slices.planes_of(item), full_slices(expected.volume.array)
@@ -92,10 +102,8 @@ def test_panel_settings_count_and_scripts_override_them(render, scene):
     assert panel.details["title"] == "MLEM, 2 iterations" and reconstructed().mphdrr_volume.shape[:] == (10, 10, 10)
     assert bpy.ops.mphdrr.reconstruct(iterations=1) == {"FINISHED"}
     assert panel.details["title"] == "MLEM, 1 iteration"
-    with pytest.raises(RuntimeError, match=r"Subsets needs Method OSEM"):
-        bpy.ops.mphdrr.reconstruct(subsets=2)
-    with pytest.raises(RuntimeError, match="Weight: missing"):
-        bpy.ops.mphdrr.reconstruct(prior="QUADRATIC")
+    refused(bpy.ops.mphdrr.reconstruct, r"Subsets needs Method OSEM", subsets=2)
+    refused(bpy.ops.mphdrr.reconstruct, "Weight: missing", prior="QUADRATIC")
 
 
 @pytest.mark.parametrize("name", METHODS)
@@ -130,10 +138,10 @@ def test_a_methods_own_settings_are_in_the_panel(render, scene):
     panel.method, panel.voxels, panel.spacing, panel.iterations = "SIRT", 6, 16.0, 4
     panel.relaxation, panel.nonnegative = 0.5, False
     assert bpy.ops.mphdrr.reconstruct() == {"FINISHED"}
-    run = read_run(storage.absolute(scene.mphdrr_projections.run_file))
+    run = shown_run()
     A = mph.projector_of_run(run, mph.Grid.centered(6, 16.0))
     expected = mph.sirt(A, run.projections, 4, relaxation=0.5, nonnegative=False).volume.array
-    np.testing.assert_allclose(volumes.volume_from_object(reconstructed()).array, expected, rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(voxels_of(reconstructed()), expected, rtol=1e-5, atol=1e-6)
 
 
 def test_a_file_can_be_the_method_and_the_result_says_so(render, scene, monkeypatch, tmp_path):
@@ -152,20 +160,17 @@ def test_a_file_can_be_the_method_and_the_result_says_so(render, scene, monkeypa
     panel = scene.mphdrr_reconstruction
     panel.method, panel.prior, panel.weight, panel.iterations, panel.voxels = "BSREM", "QUADRATIC", 0.5, 4, 10
     panel.method_file = str(tmp_path / "model.toy")
-    drawn = set(dict(panel_properties(panel)))
-    assert drawn == {"ignore_attenuation", "ignore_blur", "hole", "aperture_points", "pixel_points",
-                                       "method_file"}  # fmt: skip
+    always = {"ignore_attenuation", "ignore_blur", "hole", "aperture_points", "pixel_points", "method_file"}
+    assert set(dict(panel_properties(panel))) == always
     assert bpy.ops.mphdrr.reconstruct() == {"FINISHED"}
     known, found = panel.details, volumes.volume_from_object(reconstructed())
     assert known["title"] == "Network model.toy (Toy)" and known["flatters"][0] == "it was trained for another scanner"
     assert reconstructed().name.endswith("Network model.toy (Toy)") and known["objective"] == []
     assert found.grid.shape == grid.shape and (found.array == 2).all()
     np.testing.assert_allclose(found.grid.affine, grid.affine, atol=1e-6)
-    with pytest.raises(RuntimeError, match="does not take it"):
-        bpy.ops.mphdrr.reconstruct(iterations=3)
+    refused(bpy.ops.mphdrr.reconstruct, "does not take it", iterations=3)
     panel.method_file = str(tmp_path / "model.txt")
-    with pytest.raises(RuntimeError, match=r"or a file \(\.pt, \.toy\)"):
-        bpy.ops.mphdrr.reconstruct()
+    refused(bpy.ops.mphdrr.reconstruct, r"or a file \(\.pt, \.toy\)")
     panel.method_file = ""
     assert bpy.ops.mphdrr.reconstruct(method_file="", iterations=1) == {"FINISHED"}
     assert panel.details["title"] == "BSREM, 1 iteration"
@@ -174,14 +179,8 @@ def test_a_file_can_be_the_method_and_the_result_says_so(render, scene, monkeypa
 def test_every_setting_is_in_the_panel_or_left_to_files(scene):
     panel = scene.mphdrr_reconstruction
     all_names = {key.partition(".")[2] for key in SETTINGS if key.startswith("reconstruction.")}
-    assert all_names - set(PROPERTIES) == {
-        "allow",
-        "anatomy",
-        "stop_change",
-        "stop_noise",
-        "stop_region",
-        "stop_seconds",
-    }
+    of_files = {"allow", "anatomy", "stop_change", "stop_noise", "stop_region", "stop_seconds"}
+    assert all_names - set(PROPERTIES) == of_files
     recipe = settings_recipe(lambda name: getattr(panel, name), lambda name: False)
     assert all(recipe[setting.key] == setting.default for setting in PROPERTIES.values())
     assert "weight" not in dict(panel_properties(panel)) and "subsets" in dict(panel_properties(panel))
@@ -191,17 +190,24 @@ def test_every_setting_is_in_the_panel_or_left_to_files(scene):
     assert "subsets" not in dict(panel_properties(panel))
 
 
-def test_without_a_run_the_button_says_why(scene):
-    with pytest.raises(RuntimeError, match="poll"):
-        bpy.ops.mphdrr.reconstruct()
-    with pytest.raises(RuntimeError, match="poll"):
-        bpy.ops.mphdrr.show_reconstruction()
+def test_without_a_run_the_buttons_say_why(scene):
+    for name in ("reconstruct", "show_reconstruction", "continue_reconstruction", "backproject"):
+        refused(getattr(bpy.ops.mphdrr, name), "poll")
+    with pytest.raises(mph.InputError, match="nothing to back-project"):
+        backprojections.backproject_job(bpy.context, mph.Recipe({}), "sum")
 
 
 def test_a_radiograph_is_refused_by_methods_of_counts(render):
     render(model="TRANSMISSION")
-    with pytest.raises(RuntimeError, match="osem needs a run of counts"):
-        bpy.ops.mphdrr.reconstruct(**SMALL)
+    refused(bpy.ops.mphdrr.reconstruct, "osem needs a run of counts", **SMALL)
+
+
+@pytest.fixture
+def in_window(monkeypatch):
+    """As in a window: what is reconstructed is shown at every step."""
+    monkeypatch.setattr(reconstructions, "_MIN_INTERVAL", -1.0)
+    monkeypatch.setattr(windows, "has_window", lambda: True)
+    return monkeypatch
 
 
 def job_of(scene) -> jobs.Job:
@@ -213,10 +219,8 @@ def job_of(scene) -> jobs.Job:
     )
 
 
-def test_it_is_shown_while_it_runs_and_cancelled_without_a_trace(render, scene, monkeypatch):
+def test_it_is_shown_while_it_runs_and_cancelled_without_a_trace(render, scene, in_window):
     before = state()
-    monkeypatch.setattr(reconstructions, "_MIN_INTERVAL", -1.0)
-    monkeypatch.setattr(windows, "has_window", lambda: True)
     job, seen = job_of(scene), []
 
     def progress(done: int, total: int) -> None:
@@ -233,9 +237,7 @@ def test_it_is_shown_while_it_runs_and_cancelled_without_a_trace(render, scene, 
     assert state() == before and reconstructed() is None and not bpy.data.objects["Derenzo"].hide_get()
 
 
-def test_finish_now_keeps_what_there_is(render, scene, monkeypatch):
-    monkeypatch.setattr(reconstructions, "_MIN_INTERVAL", -1.0)
-    monkeypatch.setattr(windows, "has_window", lambda: True)
+def test_finish_now_keeps_what_there_is(render, scene, in_window):
     files = set(storage.folder().iterdir())
     job = job_of(scene)
 
@@ -250,14 +252,11 @@ def test_finish_now_keeps_what_there_is(render, scene, monkeypatch):
     assert len([item for item in volumes.volume_objects(scene) if "OSEM" in item.name]) == 1
 
 
-def test_continue_goes_on_as_if_there_had_been_no_break(render, scene, monkeypatch):
-    with pytest.raises(RuntimeError, match="poll"):
-        bpy.ops.mphdrr.continue_reconstruction()
+def test_continue_goes_on_as_if_there_had_been_no_break(render, scene, in_window):
+    refused(bpy.ops.mphdrr.continue_reconstruction, "poll")
     bpy.ops.mphdrr.reconstruct(**SMALL)
     first, record = reconstructed(), scene.mphdrr_reconstruction.record
-    array = volumes.volume_from_object(first).array
-    monkeypatch.setattr(windows, "has_window", lambda: True)
-    monkeypatch.setattr(reconstructions, "_MIN_INTERVAL", -1.0)
+    array = voxels_of(first)
     job = reconstructions.continue_job(bpy.context)
 
     def cancel(done: int, total: int) -> None:
@@ -268,14 +267,13 @@ def test_continue_goes_on_as_if_there_had_been_no_break(render, scene, monkeypat
     with pytest.raises(Cancelled):
         jobs.run(job, cancel)
     assert scene.mphdrr_reconstruction.record == record and reconstructed() == first
-    np.testing.assert_array_equal(volumes.volume_from_object(first).array, array)
-    monkeypatch.undo()
+    np.testing.assert_array_equal(voxels_of(first), array)
+    in_window.undo()
     assert bpy.ops.mphdrr.continue_reconstruction() == {"FINISHED"}
     assert reconstructed() == first and scene.mphdrr_reconstruction.details["title"] == "OSEM, 13 iterations"
     bpy.ops.mphdrr.reconstruct(**SMALL | {"iterations": 13})
     assert first.hide_get() and reconstructed() != first
-    both = [volumes.volume_from_object(item).array for item in (first, reconstructed())]
-    np.testing.assert_allclose(*both, rtol=1e-5)
+    np.testing.assert_allclose(voxels_of(first), voxels_of(reconstructed()), rtol=1e-5)
 
 
 def test_continue_goes_on_after_files_were_moved_and_opened_again(render, scene, tmp_path):
@@ -284,6 +282,8 @@ def test_continue_goes_on_after_files_were_moved_and_opened_again(render, scene,
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "second.blend"))
     shutil.rmtree(tmp_path / "first_mphdrr")
     bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "second.blend"))
+    assert voxels_of(reconstructed()).max() > 0
+    assert bpy.context.scene.mphdrr_reconstruction.details["title"] == "OSEM, 3 iterations"
     kept = reconstructions.resume_path(bpy.context)
     assert kept.parent.name == "second_mphdrr" and kept not in storage.unused_volumes()
     assert bpy.ops.mphdrr.continue_reconstruction() == {"FINISHED"}
@@ -291,11 +291,9 @@ def test_continue_goes_on_after_files_were_moved_and_opened_again(render, scene,
     assert bpy.context.scene.mphdrr_reconstruction.details["title"] == "OSEM, 13 iterations"
     assert kept in storage.unused_volumes()
     bpy.ops.mphdrr.reconstruct(**SMALL | {"iterations": 13})
-    both = [volumes.volume_from_object(item).array for item in (first, reconstructed())]
-    np.testing.assert_allclose(*both, rtol=1e-5)
+    np.testing.assert_allclose(voxels_of(first), voxels_of(reconstructed()), rtol=1e-5)
     reconstructions.resume_path(bpy.context).unlink()
-    with pytest.raises(RuntimeError, match="poll"):
-        bpy.ops.mphdrr.continue_reconstruction()
+    refused(bpy.ops.mphdrr.continue_reconstruction, "poll")
 
 
 def test_a_second_one_stands_beside_the_first(render, scene):
@@ -303,8 +301,7 @@ def test_a_second_one_stands_beside_the_first(render, scene):
     first = reconstructed()
     bpy.ops.mphdrr.reconstruct(**SMALL | {"iterations": 1})
     assert reconstructed() != first and first.name in bpy.data.objects
-    array = [volumes.volume_from_object(item).array for item in (first, reconstructed())]
-    assert not np.allclose(*array)
+    assert not np.allclose(voxels_of(first), voxels_of(reconstructed()))
 
 
 def test_the_scenes_attenuation_is_modelled_and_missed(render, scene):
@@ -313,47 +310,78 @@ def test_the_scenes_attenuation_is_modelled_and_missed(render, scene):
     scene.mphdrr_projections.volume = bpy.data.objects["Derenzo"]
     render(mu=mu)
     bpy.ops.mphdrr.reconstruct(**SMALL)
-    total = volumes.volume_from_object(reconstructed()).array.sum()
+    total = voxels_of(reconstructed()).sum()
     bpy.ops.mphdrr.reconstruct(**SMALL, ignore_attenuation=True)
-    assert volumes.volume_from_object(reconstructed()).array.sum() < 0.95 * total
+    assert voxels_of(reconstructed()).sum() < 0.95 * total
     bpy.data.objects.remove(mu)
-    with pytest.raises(RuntimeError, match="is not in the scene any more"):
-        bpy.ops.mphdrr.reconstruct(**SMALL)
+    refused(bpy.ops.mphdrr.reconstruct, "is not in the scene any more", **SMALL)
 
 
 def test_the_panel_draws_the_result(render, scene):
     bpy.ops.mphdrr.reconstruct(**SMALL | {"spacing": 4.0})  # not much more than that of the run
-    (cls,) = (cls for cls in registration.CLASSES if cls.__name__ == "MPHDRR_PT_reconstruction")
-    layout = MagicMock()
-    for part in ("box", "column", "row", "split"):
-        getattr(layout, part).return_value = layout
-    cls.draw(MagicMock(layout=layout), bpy.context)
-    said = [options["text"] for _, _, options in layout.mock_calls if options.get("text")]
-    assert {
-        "OSEM, 3 iterations",
-        "Log-likelihood",
-        "NRMSE",
-        "Show Slices",
-        "Continue (+10)",
-        "Reconstruct",
-    } <= set(said)
-    assert any(text.startswith("8 mm") for text in said)
-    flatters = scene.mphdrr_reconstruction.details["flatters"]
-    assert flatters and all(word in " ".join(said) for word in " ".join(flatters).split()), (
-        "the warning stays with the score"
+    texts = Drawn("MPHDRR_PT_reconstruction").texts
+    assert {"OSEM, 3 iterations", "Log-likelihood", "NRMSE", "Show Slices", "Continue (+10)", "Reconstruct"} <= set(
+        texts
     )
+    assert any(text.startswith("8 mm") for text in texts)
+    flatters = " ".join(scene.mphdrr_reconstruction.details["flatters"])
+    assert flatters and set(flatters.split()) <= set(" ".join(texts).split()), "the warning stays with the score"
     record = json.loads(scene.mphdrr_reconstruction.record)
     del record["flatters"]  # as earlier versions have it
     scene.mphdrr_reconstruction.record = json.dumps(record)
-    cls.draw(MagicMock(layout=layout), bpy.context)
-    assert layout.template_icon.call_args.kwargs["icon_value"] > 0 or bpy.app.background
+    icon = Drawn("MPHDRR_PT_reconstruction").layout.template_icon
+    assert icon.call_args.kwargs["icon_value"] > 0 or bpy.app.background
     plots.stop()
     assert plots.objective_icon([1.0]) >= 0
 
 
-def test_a_saved_file_opens_with_its_reconstruction(render, scene, tmp_path):
-    bpy.ops.mphdrr.reconstruct(**SMALL)
-    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "a.blend"))
-    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "a.blend"))
-    assert volumes.volume_from_object(reconstructed()).array.max() > 0
-    assert bpy.context.scene.mphdrr_reconstruction.details["title"] == "OSEM, 3 iterations"
+COARSE = {"voxels": 14, "spacing": 7.0, "center": (3.0, -2.0, 1.0)}
+LABELS = {"sum": "Sum", "product": "Geometric Mean", "minimum": "Minimum"}
+
+
+@pytest.mark.parametrize("how", LABELS)
+def test_a_back_projection_is_that_of_the_command_line(render, scene, how):
+    assert bpy.ops.mphdrr.backproject(how=how.upper(), **COARSE) == {"FINISHED"}
+    item = bpy.context.object
+    assert item.name == f"{scene.mphdrr_projections.runs[0].name} {LABELS[how]}"
+    expected = mph.backproject_run(shown_run(), how, reconstruction_recipe(**COARSE))
+    found = volumes.volume_from_object(item)
+    assert found.quantity == item.mphdrr_volume.quantity == "backprojection" and expected.array.max() > 0
+    np.testing.assert_allclose(found.array, expected.array, rtol=1e-6)
+    np.testing.assert_allclose(found.grid.affine, expected.grid.affine, atol=1e-6)
+    assert len(slices.planes_of(item)) == 3 and item.mphdrr_volume.display_high == pytest.approx(expected.array.max())
+    assert color_bar.labels(item)[0].startswith("backprojection")
+
+
+def test_a_back_projection_has_the_panels_voxels_and_stands_beside_the_last_one(render, scene):
+    panel = scene.mphdrr_reconstruction
+    panel.voxels, panel.spacing, panel.how = 10, 9.0, "MINIMUM"
+    assert bpy.ops.mphdrr.backproject() == {"FINISHED"}
+    first = bpy.context.object
+    assert first.mphdrr_volume.shape[:] == (10, 10, 10) and first.name.endswith("Minimum")
+    assert bpy.ops.mphdrr.backproject(voxels=8) == {"FINISHED"}
+    assert bpy.context.object.mphdrr_volume.shape[:] == (8, 8, 8) and first.name in scene.objects
+
+
+def test_a_back_projection_is_written_and_read_like_other_volumes(render, scene, tmp_path):
+    bpy.ops.mphdrr.backproject(**COARSE)
+    expected = volumes.volume_from_object(bpy.context.object)
+    bpy.ops.mphdrr.export_volume(filepath=str(tmp_path / "sum.vdb"))
+    bpy.ops.mphdrr.import_volume(filepath=str(tmp_path / "sum.vdb"), center=False)
+    found = volumes.volume_from_object(bpy.context.object)
+    assert found.quantity == "backprojection"
+    np.testing.assert_array_equal(found.array, expected.array)
+
+
+def test_a_cancelled_back_projection_leaves_everything_as_it_was(render, scene):
+    before = state()
+    panel = scene.mphdrr_reconstruction
+    job = backprojections.backproject_job(bpy.context, voxels_recipe(lambda name: getattr(panel, name)), "product")
+
+    def progress(done: int, total: int) -> None:
+        if done and total:
+            raise Cancelled
+
+    with pytest.raises(Cancelled):
+        jobs.run(job, progress)
+    assert state() == before

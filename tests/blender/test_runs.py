@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shutil
-from pathlib import Path
 from unittest.mock import MagicMock
 
 import bpy
@@ -23,14 +22,12 @@ from mphdrr.core.runs.recipe import Recipe
 from mphdrr.core.runs.run_recipe import run_recipe
 from mphdrr.core.volumes.volume import Volume
 
-DATA = Path(__file__).parent / "data"
+from .conftest import Drawn, module, refused, update
 
 
 @pytest.fixture
-def render(scene, ring_system):
+def render(scene, derenzo):
     """A scanner of eight modules and a phantom; the result renders what the panel says."""
-    scanner.build_scanner(scene, ring_system, "Ring")
-    bpy.ops.mphdrr.add_derenzo(voxels=16, rod_diameters=(10, 8, 0, 0, 0, 0), location=(5, -3, 2), phi=0.2)
     settings = scene.mphdrr_projections
     settings.width, settings.height, settings.model = 12, 10, "EMISSION"
 
@@ -43,18 +40,14 @@ def render(scene, ring_system):
     return now
 
 
-def module(number: int) -> bpy.types.Object:
-    return scanner.module(scanner.active_scanner(bpy.context.scene), number)
-
-
 def move(item: bpy.types.Object, distance: float) -> None:
     item.location.z += distance
-    bpy.context.view_layer.update()
+    update()
 
 
 def turn(item: bpy.types.Object, angle: float) -> None:
     item.rotation_euler.y += angle
-    bpy.context.view_layer.update()
+    update()
 
 
 def shown_array(number: int = 3) -> np.ndarray:
@@ -65,25 +58,12 @@ def array_of(item) -> np.ndarray:
     return read_run(storage.absolute(item.file)).projections
 
 
-def drawn(name: str) -> list[str]:
-    """What a panel's labels and buttons say."""
-    (cls,) = (cls for cls in registration.CLASSES if cls.__name__ == name)
-    layout = MagicMock()
-    for part in ("box", "column", "row", "split"):
-        getattr(layout, part).return_value = layout
-    panel = MagicMock(layout=layout)
-    panel.draw.side_effect = lambda context: cls.draw(panel, context)
-    assert not hasattr(cls, "poll") or cls.poll(bpy.context)
-    cls.draw(panel, bpy.context)
-    return [options["text"] for _, _, options in layout.mock_calls if options.get("text")]
-
-
 def set_(**values):
     for name, value in values.items():
         setattr(bpy.context.scene.mphdrr_projections, name, value)
 
 
-def derenzo() -> bpy.types.Object:
+def phantom() -> bpy.types.Object:
     return bpy.data.objects["Derenzo"]
 
 
@@ -98,13 +78,13 @@ EDITS = {
     "all modules: Ld 48 mm, now 47 mm": (
         lambda: setattr(scanner.active_scanner(bpy.context.scene).mphdrr_scanner, "detector_side", 47.0), None,
     ),
-    "phantom Derenzo moved": (lambda: move(derenzo(), 0.001), lambda: move(derenzo(), -0.001)),
-    "phantom Derenzo turned": (lambda: setattr(derenzo().rotation_euler, "x", 0.5), None),
+    "phantom Derenzo moved": (lambda: move(phantom(), 0.001), lambda: move(phantom(), -0.001)),
+    "phantom Derenzo turned": (lambda: setattr(phantom().rotation_euler, "x", 0.5), None),
     "phantom Derenzo changed": (
-        lambda: setattr(derenzo().mphdrr_volume.derenzo, "activity", 50.0),
-        lambda: setattr(derenzo().mphdrr_volume.derenzo, "activity", 100.0),
+        lambda: setattr(phantom().mphdrr_volume.derenzo, "activity", 50.0),
+        lambda: setattr(phantom().mphdrr_volume.derenzo, "activity", 100.0),
     ),
-    "volume Derenzo is gone": (lambda: bpy.data.objects.remove(derenzo()), None),
+    "volume Derenzo is gone": (lambda: bpy.data.objects.remove(phantom()), None),
     "time 60 s, now 30 s": (lambda: set_(time=30.0), lambda: set_(time=60.0)),
     "isotope none, now Tc-99m": (lambda: set_(isotope="Tc-99m"), lambda: set_(isotope="NONE")),
     "model SPECT Counts, now Radiograph": (lambda: set_(model="TRANSMISSION"), lambda: set_(model="EMISSION")),
@@ -123,34 +103,34 @@ def test_whatever_changes_is_said_until_it_goes_back(render, scene, said):
     assert runs.changes(scene) == []
     edit, back = EDITS[said]
     edit()
-    bpy.context.view_layer.update()
+    update()
     assert runs.changes(scene) == [said]
     if back is not None:
         back()
-        bpy.context.view_layer.update()
+        update()
         assert runs.changes(scene) == []
 
 
 def test_what_does_not_change_the_images_leaves_the_run_current(render, scene):
     render()
-    derenzo().name = "Cold rods"
+    phantom().name = "Cold rods"
     scene.mphdrr_display.colors = "GREY"
     set_(backend="NUMPY")
     bpy.ops.mphdrr.add_nema(voxels=12)
-    bpy.context.view_layer.update()
+    update()
     assert runs.changes(scene) == [] and runs.volume_to_render(scene) == "Cold rods"
 
 
 def test_a_module_moved_by_a_millimetre_is_said_by_panels_list_and_export(render, scene, tmp_path, capfd):
     item = render()
     before = array_of(item)
-    quiet = [drawn(name) for name in ("MPHDRR_PT_next_step", "MPHDRR_PT_runs", "MPHDRR_PT_export")]
+    quiet = [Drawn(name).texts for name in ("MPHDRR_PT_next_step", "MPHDRR_PT_runs", "MPHDRR_PT_export")]
     assert not any("moved" in text for texts in quiet for text in texts)
     move(module(3), 1.0)
     names = "MPHDRR_PT_next_step", "MPHDRR_PT_runs", "MPHDRR_PT_runs_of_images", "MPHDRR_PT_export"
     for name in names:
-        assert "Module 03 moved" in " ".join(drawn(name)), name
-        assert ("Render Again" in drawn(name)) == (name != "MPHDRR_PT_export")
+        assert "Module 03 moved" in " ".join(Drawn(name).texts), name
+        assert ("Render Again" in Drawn(name).texts) == (name != "MPHDRR_PT_export")
     row = MagicMock()
     row.row.return_value = row
     registration.bpy.types.MPHDRR_UL_runs.draw_item(None, bpy.context, row, scene.mphdrr_projections, item, 0, None, "")
@@ -187,7 +167,7 @@ def test_the_list_keeps_two_and_what_is_renamed_or_pinned(render, scene):
 def test_choosing_a_run_shows_its_images_and_removing_it_removes_its_file(render, scene):
     settings = scene.mphdrr_projections
     old = array_of(render())
-    move(derenzo(), 6.0)
+    move(phantom(), 6.0)
     new = array_of(render())
     assert np.array_equal(shown_array(), new[2]) and not np.array_equal(old, new)
     settings.active_run = 0
@@ -196,19 +176,12 @@ def test_choosing_a_run_shows_its_images_and_removing_it_removes_its_file(render
     path = storage.absolute(settings.run_file)
     assert bpy.ops.mphdrr.remove_run(index=0) == {"FINISHED"}
     assert not path.exists() and len(settings.runs) == 1
+    render(), bpy.ops.mphdrr.remove_run(index=0)
+    assert runs.shown_run(scene) == settings.runs[0] and settings.active_run == 0, "another one was removed"
     assert np.array_equal(shown_array(), new[2]) and runs.changes(scene) == []
     assert bpy.ops.mphdrr.remove_run() == {"FINISHED"}
     assert not settings.run_file and not planes.planes(scene) and ids.MOSAIC not in bpy.data.images
-    with pytest.raises(RuntimeError, match="No runs yet"):
-        bpy.ops.mphdrr.remove_run()
-
-
-def test_removing_another_run_leaves_the_shown_one(render, scene):
-    settings = scene.mphdrr_projections
-    render(), render()
-    shown = settings.runs[1].name
-    bpy.ops.mphdrr.remove_run(index=0)
-    assert runs.shown_run(scene).name == shown and settings.active_run == 0
+    refused(bpy.ops.mphdrr.remove_run, "No runs yet")
 
 
 def test_two_runs_survive_save_and_reopen(render, scene, tmp_path):
@@ -256,8 +229,7 @@ def test_a_run_whose_file_is_gone_is_said_and_does_not_stop_saving(render, scene
     render("one"), render()
     gone = storage.absolute(settings.runs[0].file)
     gone.unlink()
-    with pytest.raises(RuntimeError, match="the run's file is gone"):
-        bpy.ops.mphdrr.show_run(index=0)
+    refused(bpy.ops.mphdrr.show_run, "the run's file is gone", index=0)
     assert runs.shown_run(scene) == settings.runs[1] and "missing" in runs.file_size_text([settings.runs[0]])
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "a.blend"))
     assert storage.absolute(settings.runs[1].file).parent == tmp_path / "a_mphdrr"
@@ -267,7 +239,7 @@ def test_a_run_whose_file_is_gone_is_said_and_does_not_stop_saving(render, scene
 
 def test_the_difference_of_two_runs_is_drawn_and_said(render, scene, capfd):
     settings = scene.mphdrr_projections
-    render(), move(derenzo(), 3.0), render()
+    render(), move(phantom(), 3.0), render()
     found = difference(*(read_run(storage.absolute(settings.runs[i].file)) for i in (1, 0)))
     assert bpy.ops.mphdrr.compare_runs(other="0") == {"FINISHED"}
     assert found.maximum > 0 and found.text in capfd.readouterr().out
@@ -275,12 +247,11 @@ def test_the_difference_of_two_runs_is_drawn_and_said(render, scene, capfd):
     assert images.tiles(image)["numbers"] == list(range(1, 9))
     pixels = np.array(image.pixels[:]).reshape(-1, 4)
     assert (pixels[:, 0] - pixels[:, 2]).max() > 0.4 and (pixels[:, 2] - pixels[:, 0]).max() > 0.4
-    assert found.text in " ".join(drawn("MPHDRR_PT_runs"))
+    assert found.text in " ".join(Drawn("MPHDRR_PT_runs").texts)
     set_(width=14)
     render()
     assert ids.DIFFERENCE not in bpy.data.images, "it belonged to the run that was shown"
-    with pytest.raises(RuntimeError, match="cannot compare runs of different pixels: 14 x 10, and 12 x 10"):
-        bpy.ops.mphdrr.compare_runs(other="0")
+    refused(bpy.ops.mphdrr.compare_runs, "cannot compare runs of different pixels: 14 x 10, and 12 x 10", other="0")
 
 
 @pytest.mark.long
@@ -312,22 +283,6 @@ def test_runs_from_outside_set_the_panel_and_say_what_the_scene_lacks(scene, rin
     assert runs.changes(scene)[0] == "Module 03 moved" and collection.mphdrr_scanner.count == 8
 
 
-def test_a_file_of_version_0_1_0_shows_its_run(scene, tmp_path):
-    shutil.copytree(DATA / "scene-0.1.0_mphdrr", tmp_path / "scene-0.1.0_mphdrr")
-    shutil.copy(DATA / "scene-0.1.0.blend", tmp_path)
-    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "scene-0.1.0.blend"))
-    scene = bpy.context.scene
-    (item,) = scene.mphdrr_projections.runs
-    assert item.file == scene.mphdrr_projections.run_file and runs.changes(scene) == [runs.UNKNOWN]
-    assert runs.UNKNOWN in " ".join(drawn("MPHDRR_PT_runs"))
-    settings = scene.mphdrr_projections
-    settings.width, settings.height = 12, 8
-    bpy.ops.mphdrr.render_projections()
-    assert runs.changes(scene) == [] and len(settings.runs) == 2
-    settings.active_run = 0
-    assert images.projection_array(bpy.data.images["mphDRR 03"]).shape == (16, 24)
-
-
 def test_a_volume_that_is_not_in_the_panel_is_found_again(render, scene):
     """With two volumes and none chosen, the run's own is what is compared and rendered again."""
     render()
@@ -337,23 +292,3 @@ def test_a_volume_that_is_not_in_the_panel_is_found_again(render, scene):
     assert runs.changes(scene) == ["volume Derenzo, now Other"] and runs.volume_to_render(scene) == ""
     assert bpy.ops.mphdrr.render_projections() == {"FINISHED"}
     assert runs.changes(scene) == [] and rendering.run_file_path(scene.mphdrr_projections.run_file)
-
-
-def test_two_runs_of_blender_4_5_open_in_every_version(scene, tmp_path):
-    """Three modules; Module 03 was moved and the phantom turned between the runs, of which the second is shown."""
-    for name in ("runs-4.5.blend", "runs-4.5_mphdrr"):
-        (shutil.copytree if (DATA / name).is_dir() else shutil.copy)(DATA / name, tmp_path / name)
-    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "runs-4.5.blend"))
-    scene = bpy.context.scene
-    before, after = scene.mphdrr_projections.runs
-    assert (before.name, after.name) == ("Before", "Derenzo, emission") and runs.shown_run(scene) == after
-    hole = ["hole Rays, now Automatic"]  # its middle, the default of that version
-    assert runs.changes(scene, before) == ["Module 03 moved", "phantom Derenzo turned", *hole]
-    assert runs.changes(scene) == hole
-    settings = scene.mphdrr_projections
-    settings.hole, settings.aperture_points = "RAYS", 1
-    expected = array_of(after)
-    assert np.array_equal(images.projection_array(bpy.data.images["mphDRR 66"]), expected[2])
-    assert bpy.ops.mphdrr.render_projections() == {"FINISHED"}
-    np.testing.assert_allclose(array_of(settings.runs[-1]), expected, rtol=1e-6)
-    assert runs.changes(scene, settings.runs[1]) == []

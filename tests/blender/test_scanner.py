@@ -17,6 +17,8 @@ from mphdrr.core.errors import InputError
 from mphdrr.core.geometry.collimator import Construction
 from mphdrr.core.geometry.system import LENGTHS, PinholeSystem
 
+from .conftest import reopened, update
+
 
 def counts() -> dict[str, int]:
     kinds = ("objects", "meshes", "cameras", "materials", "collections")
@@ -70,7 +72,7 @@ def test_scanner_has_a_collection_per_ring_and_a_camera_per_module(scene, dc_spe
 
 def test_camera_axes_follow_the_module_frame(scene, ring_system):
     found = scanner.modules(scanner.build_scanner(scene, ring_system))
-    bpy.context.view_layer.update()
+    update()
     for camera, (u, v, k), center in zip(found, ring_system.frames(), ring_system.centers, strict=True):
         matrix = np.array(camera.matrix_world)
         assert np.allclose(matrix[:3, :3], np.stack([-u, v, -k], axis=1), atol=5e-7)
@@ -81,7 +83,7 @@ def test_camera_axes_follow_the_module_frame(scene, ring_system):
 def test_unchanged_scanner_reads_back_exactly(scene, ring_system, dc_spect):
     assert_same(scanner.read_scanner(scanner.build_scanner(scene, ring_system, "A")), ring_system)
     collection = scanner.build_scanner(scene, dc_spect)
-    bpy.context.view_layer.update()
+    update()
     back = scanner.read_scanner(collection)
     assert_same(back, dc_spect)
     assert back.source == dc_spect.source
@@ -96,8 +98,7 @@ def test_unsorted_numbers_keep_their_order(scene, ring_system):
 def test_scanner_survives_saving(scene, dc_spect, tmp_path):
     scanner.build_scanner(scene, dc_spect)
     path = str(tmp_path / "scanner.blend")
-    bpy.ops.wm.save_as_mainfile(filepath=path)
-    bpy.ops.wm.open_mainfile(filepath=path)
+    reopened(path)
     collection = scanner.active_scanner(bpy.context.scene)
     back = scanner.read_scanner(collection)
     assert_same(back, dc_spect)
@@ -121,7 +122,7 @@ def test_moved_camera_and_edited_number_are_read(scene, ring_system):
 def test_hidden_or_parented_camera_is_read_where_it_is(scene, ring_system):
     collection = scanner.build_scanner(scene, ring_system)
     scanner.show_modules(collection, 1, 1, "ONLY")
-    bpy.context.view_layer.update()
+    update()
     bench = bpy.data.objects.new("Bench", None)
     scene.collection.objects.link(bench)
     bench.location = (0, 0, 12.5)
@@ -135,7 +136,7 @@ def test_children_follow_the_camera(scene, ring_system):
     camera = scanner.module(scanner.build_scanner(scene, ring_system), 2)
     camera.location.x += 40.0
     camera.rotation_euler.z += 0.3
-    bpy.context.view_layer.update()
+    update()
     assert sorted(c.mphdrr_module.part for c in camera.children) == ["COLLIMATOR", "CRYSTAL"]
     for child in camera.children:
         assert np.allclose(child.matrix_world, camera.matrix_world, atol=1e-6)
@@ -205,7 +206,7 @@ def test_replacing_asks_for_what_would_be_lost_and_keeps_what_is_the_users(scene
     again = scanner.build_scanner(scene, ring_system[0:6], "One", replace=True)
     assert again == collection
     assert_same(scanner.read_scanner(again), ring_system[0:6])
-    bpy.context.view_layer.update()
+    update()
     place = np.array(on_module.matrix_world)[:3, 3]
     assert np.allclose(place, ring_system.centers[7], atol=2e-5), "its module has gone: it stays where it was"
     for item in (own, on_module, copy):
@@ -275,7 +276,7 @@ def test_python_ends_with_the_extension_registered():
 
 def test_numbers_that_are_animated_or_driven_are_followed(scene, ring_system):
     collection = scanner.build_scanner(scene, ring_system)
-    bpy.context.view_layer.update()
+    update()
     keyed, driven = (scanner.module(collection, number) for number in (1, 2))
     usual = [camera.mphdrr_module.sensitivity for camera in (keyed, driven)]
     for frame, diameter in ((1, 2.3), (10, 4.6)):
@@ -290,5 +291,5 @@ def test_numbers_that_are_animated_or_driven_are_followed(scene, ring_system):
     variable.targets[0].id = bpy.data.objects["Cube"]
     driver.expression = f"2.3 + {variable.name}"
     bpy.data.objects["Cube"].location.x = 2.3
-    bpy.context.view_layer.update()
+    update()
     assert driven.mphdrr_module.sensitivity == pytest.approx(4 * usual[1], rel=1e-5)

@@ -6,7 +6,6 @@ import bpy
 import numpy as np
 import pytest
 
-from mphdrr.addon.scanner import scanner
 from mphdrr.core.errors import InputError
 from mphdrr.core.geometry.collimator import Collimator, Construction
 from mphdrr.core.geometry.module_parts import check_watertight, collimator_solid, crystal_solid
@@ -37,17 +36,12 @@ def frustum(a: float, b: float, height: float) -> float:
 
 
 @pytest.mark.parametrize("size", SIZES)
-def test_collimator_is_watertight_with_one_hole(size):
+def test_collimator_is_watertight_with_one_hole_and_has_the_volume_of_its_walls(size):
     solid = collimator_solid(body(*size))
     check_watertight(solid)
     mesh = as_trimesh(*solid)
     assert mesh.is_watertight and mesh.is_winding_consistent
     assert mesh.euler_number == 0  # genus 1: the hole goes through
-    assert mesh.volume > 0
-
-
-@pytest.mark.parametrize("size", SIZES)
-def test_collimator_has_the_volume_of_its_walls(size):
     d, length, side, plate, wall, angle, place = size
     front, back = {"middle": (plate / 2, plate / 2), "front": (0.0, plate), "back": (plate, 0.0)}[place]
     polygon = 64 / 2 * np.sin(2 * np.pi / 64)  # the hole is a polygon of 64 sides
@@ -56,7 +50,7 @@ def test_collimator_has_the_volume_of_its_walls(size):
         a, b = d / 2, d / 2 + height * np.tan(angle / 2)
         return polygon * height * (a * a + a * b + b * b) / 3
 
-    corners = np.unique(collimator_solid(body(*size))[0].round(9), axis=0)
+    corners = np.unique(solid[0].round(9), axis=0)
     half = {s: np.abs(corners[np.isclose(corners[:, 2], s), :2]).max() for s in (-front, back, length)}
     # The channel is never narrower than the pyramid from the hole to the crystal, the wall never thinner than requested.
     assert half[length] == pytest.approx(side / 2 + wall)
@@ -70,7 +64,7 @@ def test_collimator_has_the_volume_of_its_walls(size):
         - cone(front)
         - cone(back)
     )
-    assert as_trimesh(*collimator_solid(body(*size))).volume == pytest.approx(expected)
+    assert mesh.volume == pytest.approx(expected)
 
 
 def test_crystal_is_a_box_behind_the_collimator():
@@ -106,9 +100,8 @@ def test_open_and_inverted_surfaces_are_refused():
         check_watertight((vertices, faces[:, ::-1]))
 
 
-def test_meshes_in_blender_are_closed_and_look_outwards(scene, ring_system):
-    collection = scanner.build_scanner(scene, ring_system)
-    meshes = {o.data for o in collection.all_objects if o.mphdrr_module.part in {"COLLIMATOR", "CRYSTAL"}}
+def test_meshes_in_blender_are_closed_and_look_outwards_in_materials_for_every_view(ring):
+    meshes = {o.data for o in ring.all_objects if o.mphdrr_module.part in {"COLLIMATOR", "CRYSTAL"}}
     for mesh in meshes:
         assert not mesh.validate(), "Blender had nothing to correct"
         vertices = np.array([v.co for v in mesh.vertices])
@@ -116,10 +109,6 @@ def test_meshes_in_blender_are_closed_and_look_outwards(scene, ring_system):
         shape = as_trimesh(vertices, faces)
         assert shape.is_watertight and shape.volume > 0
         assert len(mesh.materials) == 1 and mesh.materials[0] is not None
-
-
-def test_parts_have_materials_for_solid_and_rendered_view(scene, ring_system):
-    scanner.build_scanner(scene, ring_system)
     for material in bpy.data.materials:
         if material.name.startswith("mphDRR"):
             shader = next(n for n in material.node_tree.nodes if n.type == "BSDF_PRINCIPLED")

@@ -12,6 +12,8 @@ from mphdrr.addon.volumes import volumes
 from mphdrr.core.geometry.grid import Grid
 from mphdrr.core.volumes.volume import Volume
 
+from .conftest import Drawn, update
+
 KINDS = ("objects", "meshes", "cameras", "materials", "collections", "images")
 
 
@@ -29,7 +31,7 @@ def test_a_removed_scanner_leaves_nothing_of_its_own(scene, ring_system):
     before = names()
     collection = scanner.build_scanner(scene, ring_system, "One")
     bpy.ops.mphdrr.render_projections(width=8, height=8)
-    bpy.context.view_layer.update()
+    update()
     images = names()["images"]
     mine, marker = (bpy.data.objects.new(name, None) for name in ("Mine", "On a module"))
     collection.children[0].objects.link(mine)
@@ -38,12 +40,12 @@ def test_a_removed_scanner_leaves_nothing_of_its_own(scene, ring_system):
     marker.location.z = -20.0
     copy = scanner.module(collection, 5).copy()
     collection.children[1].objects.link(copy)
-    bpy.context.view_layer.update()
+    update()
     place = marker.matrix_world.translation.copy()
 
     assert scanner.active_scanner(scene) == collection
     assert bpy.ops.mphdrr.remove_scanner() == {"FINISHED"}
-    bpy.context.view_layer.update()
+    update()
     before["objects"] = sorted([*before["objects"], "Mine", "On a module"])
     assert names() == before | {"images": images}, "a run stays"
     assert list(mine.users_collection) == [scene.collection]
@@ -56,16 +58,11 @@ def test_a_removed_scanner_leaves_nothing_of_its_own(scene, ring_system):
 
 
 def test_cameras_that_were_edited_are_named_until_they_are_reset(scene, ring_system, monkeypatch):
-    from tests.blender.test_panels import Drawn
-
     collection = scanner.build_scanner(scene, ring_system)
     camera = scanner.module(collection, 3)
-    panel = bpy.types.MPHDRR_PT_design
 
     def said() -> str:
-        drawn = Drawn(panel)
-        panel.draw(drawn, bpy.context)
-        return " ".join(str(call) for call in drawn.layout.mock_calls)
+        return " ".join(map(str, Drawn("MPHDRR_PT_design").calls))
 
     assert "reset_cameras" not in said()
     for name, value in {
@@ -76,7 +73,7 @@ def test_cameras_that_were_edited_are_named_until_they_are_reset(scene, ring_sys
         "type": "ORTHO",
     }.items():
         setattr(camera.data, name, value)
-        bpy.context.view_layer.update()
+        update()
         assert "reset_cameras" in said() and "of 1 camera" in said(), name
         assert bpy.ops.mphdrr.reset_cameras() == {"FINISHED"}
         assert "reset_cameras" not in said(), name
@@ -133,7 +130,7 @@ def test_views_follow_the_undo_of_an_import_unless_they_were_turned(scene, ring_
 def test_lines_of_sight_are_those_of_the_cameras(scene, ring_system):
     collection = scanner.build_scanner(scene, ring_system)
     bpy.context.view_layer.objects.active = scanner.module(collection, 3)
-    bpy.context.view_layer.update()
+    update()
     state = scene.mphdrr_geometry
     assert sight_lines.lines(bpy.context) == {}
     state.show_rays = state.show_frustums = state.show_detectors = True
@@ -142,7 +139,7 @@ def test_lines_of_sight_are_those_of_the_cameras(scene, ring_system):
     assert np.allclose(ray, [views_.sources[2], views_.detector_centers[2]], atol=1e-3)
     state.sight_all = True
     scanner.show_modules(collection, 2, 8)
-    bpy.context.view_layer.update()
+    update()
     drawn = sight_lines.lines(bpy.context)
     assert {name: len(ends) for name, ends in drawn.items()} == {
         "show_rays": 7,

@@ -17,6 +17,8 @@ from mphdrr.core.geometry.grid import Grid
 from mphdrr.core.volumes.volume import Volume
 from mphdrr.core.volumes.volume_files import read_volume
 
+from .conftest import refused, update
+
 vdb = openvdb()
 
 SHEAR = np.array([[1.0, 0.3, 0.1, 0.0], [0.0, 1.0, -0.2, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
@@ -192,7 +194,7 @@ def test_other_programs_find_voxels_where_they_are(tmp_path, mirror):
     # Files for drawing are for the running Blender, and say so if they are not for other programs.
     item = volumes.add_volume(volume, "Body", pose=euler_pose(0.2, 0.1, 0.4, (9.0, 8.0, 7.0)))
     shown = item.data.filepath
-    bpy.context.view_layer.update()
+    update()
     drawn = np.array(item.matrix_world) @ [*_centroid(shown, "mu", -compat.VDB_CENTER_SHIFT), 1.0]
     np.testing.assert_allclose(drawn[:3], expected, atol=1e-4)
     note = vdb.read(shown, "mu").metadata.get("mphdrr_note", "")
@@ -206,7 +208,7 @@ def test_export_writes_a_moved_volume_for_other_programs(tmp_path, ending):
     item = volumes.add_volume(volume, "Heart")
     item.location.x += 11.0
     item.rotation_euler.y = 0.25
-    bpy.context.view_layer.update()
+    update()
     volumes.make_active(bpy.context, item)
     path = tmp_path / f"heart{ending}"
     assert bpy.ops.mphdrr.export_volume(filepath=str(path)) == {"FINISHED"}
@@ -228,8 +230,7 @@ def test_export_refuses_other_endings_and_the_scenes_own_file(tmp_path):
         (tmp_path / "a.txt", r"expected a name ending in \.vdb"),
         (volumes.file_of(item), "scene's own"),
     ):
-        with pytest.raises(RuntimeError, match=message):
-            bpy.ops.mphdrr.export_volume(filepath=str(path))
+        refused(bpy.ops.mphdrr.export_volume, message, filepath=str(path))
 
 
 def _bad(path, kind):

@@ -17,6 +17,8 @@ from mphdrr.core.geometry.grid import Grid
 from mphdrr.core.phantoms.derenzo import DerenzoPhantom
 from mphdrr.core.volumes.volume import Volume
 
+from .conftest import refused, reopened
+
 SHEAR = np.array([[1.0, 0.3, 0.0, 0.0], [0.0, 1.0, -0.2, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
 AFFINES = {
     "isotropic": np.diag([2.0, 2.0, 2.0, 1.0]),
@@ -49,8 +51,7 @@ def test_volume_comes_back_from_its_object_exactly(name, sparse_volume):
 
 def test_volume_comes_back_after_save_and_reopen(tmp_path, sparse_volume):
     volumes.add_volume(sparse_volume, "Sample")
-    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "study.blend"))
-    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "study.blend"))
+    reopened(tmp_path / "study.blend")
     item = bpy.data.objects["Sample"]
     back = volumes.volume_from_object(item)
     assert np.array_equal(back.array, sparse_volume.array)
@@ -235,8 +236,7 @@ def test_derenzo_update_remakes_the_voxels_in_place():
 )
 def test_derenzo_refuses_in_one_line_and_adds_nothing(settings, message):
     before = len(bpy.data.objects), len(bpy.data.volumes)
-    with pytest.raises(RuntimeError, match=message):
-        bpy.ops.mphdrr.add_derenzo(**settings)
+    refused(bpy.ops.mphdrr.add_derenzo, message, **settings)
     assert (len(bpy.data.objects), len(bpy.data.volumes)) == before
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import os
+import re
 import subprocess
 import sys
 from collections.abc import Callable
@@ -14,11 +15,13 @@ import numpy as np
 import pytest
 
 from mphdrr.core import events
-from mphdrr.core.errors import InputError
+from mphdrr.core.cli import main
+from mphdrr.core.errors import Cancelled, InputError
 from mphdrr.core.geometry.frames import euler_pose
 from mphdrr.core.geometry.grid import Grid
 from mphdrr.core.geometry.system import PinholeSystem
 from mphdrr.core.projector import Emission
+from mphdrr.core.recording import recorded_warnings
 from mphdrr.core.volumes.volume import Volume
 from mphdrr.core.workbook import read_system
 
@@ -27,14 +30,28 @@ from .small_events import small_recipe
 
 WORKBOOK = Path(__file__).parents[2] / "examples" / "dc-spect-80.xlsx"
 
-_needs_torch = pytest.mark.skipif(importlib.util.find_spec("torch") is None, reason="torch is not installed")
-BACKENDS = ["numpy", pytest.param("torch", marks=_needs_torch), "cpu"]
+needs_torch = pytest.mark.skipif(importlib.util.find_spec("torch") is None, reason="torch is not installed")
+BACKENDS = ["numpy", pytest.param("torch", marks=needs_torch), "cpu"]
 """Parameters of what holds of every backend on the processor."""
 
 
 @pytest.fixture
 def rng() -> np.random.Generator:
     return np.random.default_rng(20261121)
+
+
+@pytest.fixture
+def command(capsys: pytest.CaptureFixture[str]) -> Callable[..., Any]:
+    """Return a function that runs `mphdrr` with words, checks its status, and returns what it printed: `out`, `err`."""
+
+    def run(*words: object, status: int = 0) -> Any:
+        capsys.readouterr()
+        result = main([*map(str, words)])
+        printed = capsys.readouterr()
+        assert result == status, printed.err
+        return printed
+
+    return run
 
 
 @pytest.fixture(scope="session")
@@ -74,6 +91,11 @@ def general_grid(rng: np.random.Generator, shape: tuple[int, int, int]) -> Grid:
     return Grid(shape, affine)
 
 
+def voxel_centers(grid: Grid) -> np.ndarray:
+    """World places (n_x, n_y, n_z, 3) of a grid's voxels."""
+    return np.moveaxis(np.indices(grid.shape), 0, -1) @ grid.affine[:3, :3].T + grid.affine[:3, 3]
+
+
 def emission(system: PinholeSystem, mu: Volume | None = None, **options: Any) -> Emission:
     """Emission with one ray to each pixel's centre, for laws of single rays; without the warning that these are too few.
 
@@ -100,17 +122,46 @@ def same_matter(grid: Grid, mu: np.ndarray) -> list[Volume]:
 
 
 def refused(call: Callable[[], object], *words: str) -> None:
-    """`call` is refused in one line that has these words."""
+    """Check that `call` is refused in one line that has these words, or what matches them as regular expressions."""
     with pytest.raises(InputError) as error:
         call()
     text = str(error.value)
-    assert all(word in text for word in words) and "\n" not in text, text
+    assert all(word in text or re.search(word, text) for word in words) and "\n" not in text, text
+
+
+def warned(call: Callable[[], object]) -> list[str]:
+    """Return the warnings of `call`, each one a line."""
+    with recorded_warnings() as texts:
+        call()
+    assert not any("\n" in text for text in texts)
+    return texts
+
+
+def stop(*_: object) -> None:
+    """Cancel whatever reports its progress."""
+    raise Cancelled
+
+
+def assert_progress(call: Callable[[Callable[..., None]], object], steps: int = 2) -> None:
+    """Check that `call(progress)` goes on to its end in `steps` or more, and ends where its progress is cancelled."""
+    shares: list[float] = []
+    call(lambda done, total: shares.append(done / total))
+    assert shares == sorted(shares) and shares[-1] == 1 and len(shares) >= steps
+    with pytest.raises(Cancelled):
+        call(stop)
+
+
+def refused_command(capsys: pytest.CaptureFixture[str], *words: object) -> str:
+    """Run a command that is refused in one line, and return the line."""
+    assert main([*map(str, words)]) == 1
+    (line,) = [line for line in capsys.readouterr().err.splitlines() if not line.startswith("mphdrr: warning")]
+    return line.removeprefix("mphdrr: ")
 
 
 def run_python(
     code: str, environment: dict[str, str] | None = None, **options: Any
 ) -> subprocess.CompletedProcess[str]:
-    """What a Python of its own says to `code`."""
+    """Run `code` in a Python of its own, and return what it printed."""
     together = os.environ | (environment or {})
     return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=together, **options)
 

@@ -1,14 +1,12 @@
 """Views of deliberately odd geometry, for laws that must hold of any views."""
 
-from __future__ import annotations
-
 import numpy as np
 
-from mphdrr.core.geometry.frames import affine_matrix, euler_pose, module_frames
-from mphdrr.core.geometry.views import Views
+import mphdrr.core as mph
+from mphdrr.core.geometry.frames import affine_matrix, module_frames
 
 
-def odd_views(parallel: bool = False) -> Views:
+def odd_views(parallel: bool = False) -> mph.Views:
     """Six views of the isocentre's surroundings, each odd in another way; all have the isocentre in their image.
 
     Pixels of other pitch along u and v, the principal point off the centre, a turn about the axis, a mirrored grid, skewed
@@ -30,13 +28,15 @@ def odd_views(parallel: bool = False) -> Views:
     for m, share in ((4, 0.3), (5, -0.2)):  # skewed
         v_steps[m] += share * u_steps[m]
     for m in (4, 5):  # oblique
-        tilt = affine_matrix(frames[m].T, [0, 0, 0]) @ euler_pose(0.4, 0.35, -0.2)
+        tilt = affine_matrix(frames[m].T, [0, 0, 0]) @ mph.euler_pose(0.4, 0.35, -0.2)
         turn = tilt[:3, :3] @ frames[m]
         u_steps[m], v_steps[m] = turn @ u_steps[m], turn @ v_steps[m]
     middles = centers + distances[:, None] * frames[:, 2] + np.einsum("mi,mij->mj", offsets, frames[:, :2])
-    return Views(centers, middles, u_steps, v_steps, (90, 100), parallel)
+    return mph.Views(centers, middles, u_steps, v_steps, (90, 100), parallel)
 
 
-def points_seen(views: Views, rng: np.random.Generator, n: int) -> np.ndarray:
-    """World points (n, 3), mm, around the isocentre."""
-    return rng.uniform(-40, 40, (n, 3))
+def moved_views(views: mph.Views, pose: np.ndarray) -> mph.Views:
+    """Return views that a pose (4, 4) has moved in space."""
+    points = (x @ pose[:3, :3].T + pose[:3, 3] for x in (views.sources, views.detector_centers))
+    steps = (x @ pose[:3, :3].T for x in (views.u_steps, views.v_steps))
+    return mph.Views(*points, *steps, views.shape, views.parallel)

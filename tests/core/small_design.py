@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from mphdrr.core.design.recipe import DesignRecipe, design_recipe
-from mphdrr.core.toml import parse_toml
+from mphdrr.core.recipes.toml import parse_toml
 
 BODY = '[[shape]]\nkind = "sphere"\nradius = 20\nactivity = 50\n'
 PARTS = (

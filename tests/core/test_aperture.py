@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 import itertools
 
@@ -12,14 +11,11 @@ import pytest
 import mphdrr.core as mph
 from mphdrr.core.physics.aperture import KnifeEdge, openings
 
-from .conftest import emission, general_grid, refused
-from .test_emission import BACKENDS, assert_adjoint, assert_real_is_virtual, one_module, spot_image, turned_grid
+from .conftest import emission, refused
+from .test_emission import one_module, turned_grid
+from .traced_photons import image_of_voxel, misplaced, traced_image
 
 KNIFE = KnifeEdge(radius=1.1, mu=3.0, tangent=0.8)
-OPTIONS = {
-    "aperture_points": 3, "aperture_mu": 2.0, "edge": "path", "crystal_mu": 0.1, "depth_layers": 3,
-    "within_cone": True, "within_walls": True, "within_crystal": True,
-}  # fmt: skip
 
 
 def ellipse_area(length, slope):
@@ -34,16 +30,20 @@ def ellipse_area(length, slope):
     return np.pi * k * np.sqrt(k**2 - (a * slope) ** 2) / (t * np.sqrt(squared))
 
 
-def test_path_through_the_edge_equals_a_fine_walk_along_the_line(rng):
+@pytest.mark.parametrize(
+    ("plate", "nearest", "tangent"), [(None, 1.1, 0.8), (0.6, 0.0, 0.3), (2.0, 0.0, 0.8), (4.0, 0.0, 1.4)]
+)
+def test_path_through_the_edge_and_its_plate_equals_a_fine_walk_along_the_line(plate, nearest, tangent, rng):
+    edge = KnifeEdge(1.1, 0.3, tangent, plate)
+    z = np.linspace(-60, 60, 1_200_001)
     for _ in range(12):
-        radius, angle, slope_u, slope_v = rng.uniform((1.1, 0, -0.5, -0.5), (2.5, 7, 0.5, 0.5))
+        radius, angle, slope_u, slope_v = rng.uniform((nearest, 0, -0.5, -0.5), (2.5, 7, 0.5, 0.5))
         x, y = radius * np.cos(angle), radius * np.sin(angle)
-        z = np.linspace(-60, 60, 1_200_001)
-        inside = np.hypot(x + z * slope_u, y + z * slope_v) > KNIFE.radius + np.abs(z) * KNIFE.tangent
+        inside = np.hypot(x + z * slope_u, y + z * slope_v) > edge.radius + np.abs(z) * tangent
+        inside &= np.abs(z) < (plate or np.inf) / 2
         length = inside.sum() * (z[1] - z[0]) * np.sqrt(1 + slope_u**2 + slope_v**2)
-        slopes = np.array([slope_u]), np.array([slope_v])
-        passed = dataclasses.replace(KNIFE, mu=0.01).transmission(x, y, *slopes)[0]
-        assert -np.log(passed) / 0.01 == pytest.approx(length, abs=1e-3)
+        passed = edge.transmission(x, y, np.array([slope_u]), np.array([slope_v]))[0]
+        assert passed == pytest.approx(np.exp(-edge.mu * length), abs=3e-4)
 
 
 def test_nothing_passes_steeper_than_the_cone():
@@ -66,29 +66,6 @@ def test_open_area_equals_the_integral_over_paths(n):
             assert abs(area - expected) < tolerance * np.pi / 4 * d**2
             if slope == 0:
                 assert area * 4 / np.pi == pytest.approx(d**2 + 2 * d * t / mu + 2 * t**2 / mu**2, rel=1e-12)
-
-
-@pytest.mark.parametrize("n", [1, 5])
-def test_an_opaque_edge_leaves_the_hole(n):
-    """At every angle within the cone: the hole's obliquity is in cos^4(psi)."""
-    for slope in (0.0, 0.3, 0.79):
-        slopes = np.array([slope]), np.array([0.0])
-        area = sum(opening.area(*slopes)[0] for opening in openings(n, 2.2, dataclasses.replace(KNIFE, mu=1e7)))
-        assert area == pytest.approx(np.pi / 4 * 2.2**2, rel=1e-6)
-
-
-@pytest.mark.parametrize("n", [1, 7])
-def test_point_source_on_the_axis_counts_what_the_edge_lets_pass(n):
-    """Against the solid angle of the hole and the edge, integrated over the plane with each point's own direction."""
-    system, mu = one_module(), 3.6
-    model = emission(system, aperture_points=n, aperture_mu=mu, edge="path")
-    image, _ = spot_image(model, (0, 0, 0))
-    h = 200.0
-    r = (np.arange(400_000) + 0.5) * 1e-5  # to 4 mm
-    passed = np.where(r < 1, 1.0, KnifeEdge(1.0, mu, 1.0).transmission(r, 0.0, r / h, 0 * r))
-    solid = np.sum(passed * h / (h**2 + r**2) ** 1.5 * r) * 1e-5 / 2
-    assert image.sum() == pytest.approx(solid * 1.2**3, rel=5e-3)
-    assert model.effective_diameter[0] ** 2 == pytest.approx(4 + 4 / mu + 2 / mu**2)
 
 
 FINE, SIDE = 0.1, 8.0
@@ -161,31 +138,6 @@ def test_walls_stop_what_would_enter_the_crystals_sides():
     assert not middle[places > 24].any()
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
-@pytest.mark.parametrize(
-    "options",
-    [
-        {"aperture_points": 3, "aperture_mu": 2.0, "edge": "path"},
-        {"aperture_mu": 2.0, "edge": "path", "within_cone": True, "within_walls": True},
-        {"crystal_mu": 0.1, "depth_layers": 3, "within_walls": True, "within_crystal": True, "intrinsic_fwhm": 5.0},
-        {"aperture_tolerance": 0.3, "isotope": "Tc-99m", "time": 600.0},
-    ],
-)
-def test_adjoint_of_every_option(backend, options, system, rng):
-    A = mph.Projector(
-        general_grid(rng, (9, 8, 7)),
-        system[3:5].views((10, 11), offset=(20.0, 0.0)),
-        emission(system[3:5], **options),
-        backend,
-        threads=2,
-    )
-    assert_adjoint(A, rng)
-
-
-def test_real_and_virtual_detector_agree_on_every_option(system, rng):
-    assert_real_is_virtual(emission(system, **OPTIONS), rng)
-
-
 def test_bad_apertures_and_crystals_are_refused(system):
     for arguments, word in (
         ({"aperture_points": 0}, "aperture_points"),
@@ -211,7 +163,10 @@ def test_bad_apertures_and_crystals_are_refused(system):
 def test_weights_of_tensors_are_those_of_arrays_and_differentiable():
     """By the pixels' positions and the collimator's length, for optimising the poses of cameras that count photons."""
     torch = pytest.importorskip("torch", reason="torch is not installed")
-    model = emission(one_module(), **OPTIONS)
+    model = emission(
+        one_module(), aperture_points=3, aperture_mu=2.0, edge="path", crystal_mu=0.1, depth_layers=3, within_cone=True,
+        within_walls=True, within_crystal=True,
+    )  # fmt: skip
     u, v = np.linspace(-24, 23, 6)[None], np.linspace(-22, 21, 5)[:, None]
     for opening in model.openings(0, 3)[::4]:
         for layer in (0, 2):
@@ -230,52 +185,20 @@ def test_memory_is_asked_for_mu_and_for_weights(system, monkeypatch):
     grid, views = mph.Grid.centered((40, 40, 40), 2.0), system.views((4, 4))
     large = mph.Volume(np.zeros((80, 80, 80), np.float32), mph.Grid.centered(80, 2.0), "mu")
     monkeypatch.setattr("mphdrr.core.memory.available", lambda: 600_000)
-    for model, fits in (
-        (emission(system), True),
-        (emission(system, large), False),
-        (mph.InverseSquareSum(system), False),
-    ):
-        A = mph.Projector(grid, views, model, "numpy")
+    for model in (None, emission(system, large), mph.InverseSquareSum(system)):
+        A = mph.Projector(grid, views, model or emission(system), "numpy")
         for run, x in ((A, np.zeros(grid.shape)), (A.T, np.zeros(A.shape_out))):
-            if fits:
-                run(x)
-            else:
+            if model:
                 refused(lambda run=run, x=x: run(x), "of memory")
+            else:
+                run(x)
 
 
-def test_the_whole_camera_counts_like_photons_one_by_one(rng):
-    """Photons from a spot through the edge into the crystal: number, mean and deviation of the recorded positions."""
-    system, n = one_module(detector_side=30.0), 1_000_000
-    grid = turned_grid((3, 3, 3), 1.0, (20.0, 37.0, -20.0))
-    edge, crystal_mu, far = KnifeEdge(1.0, 1.5, 1.0), 0.15, 4.0
-
-    # From anywhere in the spot, to anywhere in the pinhole's plane around the hole: (u, v, towards the pinhole), mm.
-    inside = rng.uniform(-0.5, 2.5, (n, 3)) @ grid.affine[:3, :3].T + grid.affine[:3, 3] - system.centers[0]
-    u, v, h = system.frames()[0] @ inside.T
-    radius, angle = far * np.sqrt(rng.random(n)), rng.uniform(0, 2 * np.pi, n)
-    x, y = radius * np.cos(angle), radius * np.sin(angle)
-    slope_u, slope_v = (u - x) / h, (v - y) / h
-    cosine = 1 / np.sqrt(1 + slope_u**2 + slope_v**2)
-    chance = np.pi * far**2 * cosine**3 / (4 * np.pi * h**2)  # to leave towards the area of the plane
-    beyond = edge.transmission(x, y, slope_u, slope_v)
-    chance *= np.where(radius < 1, slope_u**2 + slope_v**2 < 1, beyond)
-    depth = rng.exponential(cosine / crystal_mu)
-    front_u, front_v = x - 60 * slope_u, y - 60 * slope_v
-    chance *= (depth < 10) & (np.abs(front_u) < 15) & (np.abs(front_v) < 15)
-    seen = chance / chance.sum()
-    places = np.stack([x - (60 + depth) * slope_u, y - (60 + depth) * slope_v])
-
-    model = emission(
-        system, aperture_points=37, aperture_mu=edge.mu, edge="path", crystal_mu=crystal_mu, depth_layers=9,
-        within_walls=True,
-    )  # fmt: skip
-    views = system.views((100, 100), "real", pitch=0.4)
-    image = mph.Projector(grid, views, model)(np.ones(grid.shape))[0].astype(float)
-    pixels = np.arange(100) * 0.4 - 19.8
-    marginals = image.sum(axis=0) / image.sum(), image.sum(axis=1) / image.sum()
-    assert image.sum() == pytest.approx(chance.mean() * 27, rel=0.01)
-    for place, marginal in zip(places, marginals, strict=True):
-        mean = marginal @ pixels
-        assert mean == pytest.approx(seen @ place, abs=0.02)
-        spread = np.sqrt(seen @ place**2 - (seen @ place) ** 2)
-        assert np.sqrt(marginal @ pixels**2 - mean**2) == pytest.approx(spread, rel=0.02)
+def test_the_whole_camera_counts_like_photons_one_by_one():
+    """Photons from a cube through the edge into the crystal."""
+    system, place, size = one_module(), (20.0, -12.0, 190.0), 6.0
+    exact = traced_image(system, place, 16, size, edge_mu=1.5, crystal_mu=0.15)
+    rays = {"hole": "rays", "aperture_points": 37, "pixel_points": 21, "depth_layers": 9, "tolerance": 1e9}
+    image = image_of_voxel(system, place, 16, size, aperture_mu=1.5, edge="path", crystal_mu=0.15, **rays)
+    assert misplaced(image, exact) < 0.015
+    assert image.sum() == pytest.approx(exact.sum(), rel=0.01)

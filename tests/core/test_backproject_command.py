@@ -1,7 +1,5 @@
 """``mphdrr backproject``: it does what Python does; line integrals of runs; what is written and refused."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 
@@ -12,6 +10,8 @@ import mphdrr.core as mph
 from mphdrr.core.cli import backproject as command_module
 from mphdrr.core.cli import main
 
+from .conftest import refused_command, stop
+
 COUNTS = {"model.kind": "emission", "model.time": 60.0, "model.hole": "point", "model.pixel_points": 1,
           "model.tolerance": 1e9, "detector.rows": 24, "detector.columns": 20, "detector.plane": "real",
           "phantom.kind": "derenzo", "phantom.voxels": 30}  # fmt: skip
@@ -21,27 +21,18 @@ GRID = mph.Grid.centered((18, 17, 16), 4.0, (3, 2, 1))
 
 
 def made(scanner, **changes) -> mph.ProjectionRun:
-    (run,) = mph.run_recipe(
-        mph.Recipe(COUNTS).updated({key.replace("__", "."): v for key, v in changes.items()}), scanner
-    )
-    return run
+    return next(mph.run_recipe(mph.Recipe(COUNTS).updated(changes), scanner[::8]))
 
 
 @pytest.fixture(scope="module")
 def run(scanner) -> mph.ProjectionRun:
-    return made(scanner[::8])
+    return made(scanner)
 
 
 @pytest.fixture
 def file(run, tmp_path) -> str:
     mph.write_run(run, tmp_path / "run.npz")
     return str(tmp_path / "run.npz")
-
-
-def refused(capsys, *words: object) -> str:
-    assert main(["backproject", *map(str, words)]) == 1
-    (line,) = capsys.readouterr().err.splitlines()
-    return line
 
 
 @pytest.mark.parametrize("changes", [
@@ -51,25 +42,23 @@ def refused(capsys, *words: object) -> str:
 @pytest.mark.filterwarnings("ignore::mphdrr.core.errors.InputWarning")
 def test_counts_of_ideal_pinholes_become_line_integrals(scanner, changes):
     """Whatever hole, crystal, time and background, and of modules of several lengths and diameters."""
-    run = made(scanner[::8], **changes)
+    run = made(scanner, **changes)
     far = run.views if run.recipe["detector.plane"] == "real" else run.system.views((24, 20), magnification=30.0)
     integrals = mph.Projector(run.volume.grid, far)(run.volume)
-    found = mph.run_line_integrals(run)
+    result = mph.run_line_integrals(run)
+    np.testing.assert_allclose(result, integrals, atol=1e-5 * integrals.max())
     for background in (np.arange(10.0), np.full(run.projections.shape, 0.5)):
-        images = background if background.ndim == 3 else background[:, None, None]
-        other = replace(run, projections=run.projections - run.background + images, background=background)
-        np.testing.assert_allclose(mph.run_line_integrals(other), found, atol=2e-3 * found.max())
-    np.testing.assert_allclose(found, integrals, atol=1e-5 * integrals.max())
+        images = run.projections - run.background + background.reshape(10, *background.shape[1:] or (1, 1))
+        same = mph.run_line_integrals(replace(run, projections=images, background=background))
+        np.testing.assert_allclose(same, result, atol=2e-3 * result.max())
 
 
 def test_radiographs_are_line_integrals_as_they_are(scanner):
-    run = made(scanner[::8], **{"model.kind": "transmission"})
+    run = made(scanner, **{"model.kind": "transmission"})
     np.testing.assert_array_equal(mph.run_line_integrals(run), run.projections)
     mu = mph.Volume(0.01 * run.volume.array / run.volume.array.max(), run.volume.grid, "mu")
-    recipe = mph.Recipe(
-        {"model.kind": "transmission", "model.photons": 1e6, "detector.rows": 24, "detector.columns": 20}
-    )
-    (photons,) = mph.run_recipe(recipe, run.system, mu)
+    settings = {"model.kind": "transmission", "model.photons": 1e6, "detector.rows": 24, "detector.columns": 20}
+    (photons,) = mph.run_recipe(mph.Recipe(settings), run.system, mu)
     assert photons.unit == "photons"
     exact = mph.Projector(mu.grid, photons.views)(mu)
     np.testing.assert_allclose(mph.run_line_integrals(photons), exact, atol=1e-5 * exact.max())
@@ -79,16 +68,14 @@ def test_radiographs_are_line_integrals_as_they_are(scanner):
 def test_the_command_does_what_python_does(run, file, tmp_path, capsys, how):
     output, count = tmp_path / "new" / "b.nii.gz", tmp_path / "n.nrrd"
     assert main(["backproject", file, *SMALL, "--how", how, "-o", str(output), "--views-that-see", str(count)]) == 0
-    said = capsys.readouterr().out
-    found = mph.read_volume(output)
+    volume, seeing = mph.read_volume(output), mph.read_volume(count)
     expected = mph.backproject(np.maximum(mph.run_line_integrals(run), 0), run.views, GRID, how)
-    assert found.quantity == "backprojection" and found.grid.shape == (18, 17, 16)
-    np.testing.assert_array_equal(found.array, expected.array)
-    np.testing.assert_array_equal(mph.backproject_run(run, how, grid=GRID).array, expected.array)
-    seeing = mph.read_volume(count)
+    assert volume.quantity == "backprojection" and volume.grid.shape == (18, 17, 16)
+    for array in (volume.array, mph.backproject_run(run, how, grid=GRID).array):
+        np.testing.assert_array_equal(array, expected.array)
     np.testing.assert_array_equal(seeing.array, mph.views_that_see(run.views, GRID).array)
     assert seeing.quantity == "modules"
-    assert said == (
+    assert capsys.readouterr().out == (
         f"{output}: {how}, 18 x 17 x 16 voxels, {expected.array.min():.4g} to {expected.array.max():.4g}, "
         f"each seen by {seeing.array.min():.0f} to {seeing.array.max():.0f} of 10 views\n"
     )
@@ -106,40 +93,35 @@ def test_the_usual_voxels_are_those_of_reconstructions(run, file, tmp_path, caps
 
 
 def test_noise_below_the_background_is_none(run):
-    low = mph.ProjectionRun(
-        0 * run.projections, run.system, run.views, run.volume, "counts", run.settings, background=3.0
-    )
+    low = replace(run, projections=0 * run.projections, background=3.0)
     assert mph.run_line_integrals(low).max() < 0
     assert not mph.backproject_run(low, "product", grid=GRID).array.any()
     assert mph.backproject_run(low, "sum", grid=GRID).array.min() < 0
 
 
 @pytest.mark.filterwarnings("ignore::mphdrr.core.errors.InputWarning")
-def test_what_is_not_understood_is_refused_before_anything_is_written(scanner, run, file, tmp_path, capsys):
+def test_what_is_not_understood_is_refused_before_anything_is_written(scanner, file, tmp_path, capsys):
     output = tmp_path / "b.nii.gz"
-    assert "no such file" in refused(capsys, tmp_path / "none.h5", "-o", output)
-    assert ".nii.gz" in refused(capsys, file, "-o", tmp_path / "b.txt")
-    assert "same file as --output" in refused(capsys, file, "-o", output, "--views-that-see", output)
-    assert "voxels" in refused(capsys, file, "--voxels", "0", "-o", output)
-    assert "no view sees any" in refused(capsys, file, *SMALL, "--center", "0", "0", "5000", "-o", output)
-    assert main(["backproject", file, "--how", "mean", "-o", str(output)]) == 2
-    assert main(["backproject", file]) == 2
-    capsys.readouterr()
-    other = made(scanner[::8], **{"model.kind": "inverse-square"})
-    mph.write_run(other, tmp_path / "other.npz")
-    assert "inverse-square are no line integrals" in refused(capsys, tmp_path / "other.npz", "-o", output)
-    wide = made(scanner[::8], **{"detector.pitch": 4.0, "model.within_crystal": True})
-    mph.write_run(wide, tmp_path / "wide.npz")
-    for how in ("product", "minimum"):
-        assert "beyond the crystals" in refused(capsys, tmp_path / "wide.npz", "--how", how, "-o", output)
-    assert mph.backproject_run(wide, grid=GRID).array.max() > 0
+    wide = {"detector.pitch": 4.0, "model.within_crystal": True}
+    for name, changes in (("other", {"model.kind": "inverse-square"}), ("wide", wide)):
+        mph.write_run(made(scanner, **changes), tmp_path / f"{name}.npz")
+    for words, message in (
+        ([tmp_path / "none.h5"], "no such file"),
+        ([file, "-o", tmp_path / "b.txt"], ".nii.gz"),
+        ([file, "--views-that-see", output], "same file as --output"),
+        ([file, "--voxels", 0], "voxels"),
+        ([file, *SMALL, "--center", 0, 0, 5000], "no view sees any"),
+        ([tmp_path / "other.npz"], "inverse-square are no line integrals"),
+        ([tmp_path / "wide.npz", "--how", "product"], "beyond the crystals"),
+        ([tmp_path / "wide.npz", "--how", "minimum"], "beyond the crystals"),
+    ):
+        assert message in refused_command(capsys, "backproject", "-o", output, *words)
+    assert main(["backproject", file, "--how", "mean", "-o", str(output)]) == main(["backproject", file]) == 2
+    assert mph.backproject_run(mph.read_run(tmp_path / "wide.npz"), grid=GRID).array.max() > 0
     assert not output.exists()
 
 
 def test_cancelled_it_leaves_no_file(run, file, tmp_path, monkeypatch, capsys):
-    def stop(done: int, total: int) -> None:
-        raise mph.Cancelled
-
     monkeypatch.setattr(command_module, "progress_bar", lambda label: stop)
     assert main(["backproject", file, *SMALL, "-o", str(tmp_path / "b.nii.gz")]) == 130
     assert "cancelled" in capsys.readouterr().err

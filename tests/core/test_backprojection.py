@@ -1,7 +1,5 @@
 """Back-projections: sum, geometric mean and minimum over views, the number of views, depth distributions, the findings."""
 
-from __future__ import annotations
-
 import tracemalloc
 
 import numpy as np
@@ -10,7 +8,7 @@ import pytest
 import mphdrr.core as mph
 from mphdrr.core.perspective import places
 
-from .conftest import general_grid, refused
+from .conftest import assert_progress, general_grid, refused
 
 WAYS = ("sum", "product", "minimum")
 
@@ -27,20 +25,20 @@ def odd_views(parallel: bool = False) -> mph.Views:
 
 
 def sampled(array: np.ndarray, index: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Values (N,) at fractional indices (N, axes), linearly between elements; and which lie within the outer edges."""
+    """Return values (N,) at fractional indices (N, axes), linear between elements, and which lie in the outer edges."""
     n = np.array(array.shape)
     within = ((index >= -0.5) & (index <= n - 0.5)).all(axis=1)
     place = np.clip(np.nan_to_num(index), 0, n - 1)
-    value = np.zeros(len(index))
+    first, value = np.floor(place), np.zeros(len(index))
     for corner in np.ndindex(*(2,) * array.ndim):
-        at = np.minimum(np.floor(place).astype(int) + corner, n - 1)
-        share = np.where(corner, place - np.floor(place), 1 - (place - np.floor(place)))
-        value += share.prod(axis=1) * array[tuple(at.T)]
+        elements = np.minimum(first.astype(int) + corner, n - 1)
+        weights = np.where(corner, place - first, 1 - (place - first))
+        value += weights.prod(axis=1) * array[tuple(elements.T)]
     return value, within
 
 
 def what_views_say(images: np.ndarray, views: mph.Views, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Each view's value (M, N) at world points (N, 3), and whether it sees them."""
+    """Return each view's value (M, N) at world points (N, 3), and whether it sees them."""
     values, seen = [], []
     for image, matrix in zip(images, views.projection_matrices(), strict=True):
         p = np.c_[points, np.ones(len(points))] @ matrix.T
@@ -53,11 +51,10 @@ def what_views_say(images: np.ndarray, views: mph.Views, points: np.ndarray) -> 
 def put_together(values: np.ndarray, seen: np.ndarray, how: str) -> np.ndarray:
     if how == "sum":
         return np.where(seen, values, 0).sum(axis=0)
-    if how == "minimum":
-        return np.where(seen.any(axis=0), np.where(seen, values, np.inf).min(axis=0), 0)
     with np.errstate(divide="ignore", invalid="ignore"):
-        mean = np.exp(np.where(seen, np.log(values), 0).sum(axis=0) / seen.sum(axis=0))
-    return np.where(seen.any(axis=0), mean, 0)
+        means = np.exp(np.where(seen, np.log(values), 0).sum(axis=0) / seen.sum(axis=0))
+    minima = np.where(seen, values, np.inf).min(axis=0)
+    return np.where(seen.any(axis=0), minima if how == "minimum" else means, 0)
 
 
 def centers(grid: mph.Grid | mph.PerspectiveGrid) -> np.ndarray:
@@ -88,30 +85,29 @@ def lattices(grid: mph.Grid, views: mph.Views) -> list[mph.Grid | mph.Perspectiv
 def test_it_is_what_the_views_say_of_each_place(rng, grid, monkeypatch, kernel, parallel, how):
     if kernel == "numpy":
         monkeypatch.setattr(places, "_gather_kernel", None)
-    views = odd_views(parallel)
-    images = rng.random((4, 23, 26)).astype(np.float32)
+    views, images = odd_views(parallel), rng.random((4, 23, 26)).astype(np.float32)
     for lattice in lattices(grid, views):
         values, seen = what_views_say(images, views, centers(lattice))
-        found, count = (
-            array_of(r) for r in (mph.backproject(images, views, lattice, how), mph.views_that_see(views, lattice))
-        )
+        result = array_of(mph.backproject(images, views, lattice, how))
+        count = array_of(mph.views_that_see(views, lattice))
         assert set(seen.sum(axis=0).tolist()) >= {1, 2, 3}
         assert lattice is not grid or not seen.any(axis=0).all()
         # On an image's edge float32 and float64 may see different things.
         sure = count == seen.sum(axis=0)
         assert sure.mean() > 0.9995
-        np.testing.assert_allclose(found[sure], put_together(values, seen, how)[sure], atol=5e-5)
+        np.testing.assert_allclose(result[sure], put_together(values, seen, how)[sure], atol=5e-5)
 
 
 @pytest.mark.parametrize("how", WAYS)
 def test_views_in_any_order_say_the_same_and_factors_stay(rng, grid, how):
-    views, images = odd_views(), rng.random((4, 23, 26))
-    found = array_of(mph.backproject(images, views, grid, how))
-    order = [2, 0, 3, 1]
+    views, images, order = odd_views(), rng.random((4, 23, 26)), [2, 0, 3, 1]
+    volume = mph.backproject(images, views, grid, how)
+    result = array_of(volume)
+    assert volume.quantity == "backprojection"
     ordered = array_of(mph.backproject(images[order], views[order], grid, how))
-    np.testing.assert_allclose(ordered, found, rtol=2e-6, atol=2e-6)
     larger = array_of(mph.backproject(37.0 * images, views, grid, how))
-    np.testing.assert_allclose(larger / 37, found, rtol=2e-6, atol=2e-6)
+    for same in (ordered, larger / 37):
+        np.testing.assert_allclose(same, result, rtol=2e-6, atol=2e-6)
 
 
 @pytest.mark.parametrize("value", [1e-37, 1e-6, 1.0, 1e6, 3e36])
@@ -130,8 +126,8 @@ def test_where_one_view_sees_nothing_nothing_is(rng, grid):
     images[1] = 0
     seen = what_views_say(images, views, centers(grid))[1]
     for how in ("product", "minimum"):
-        found = array_of(mph.backproject(images, views, grid, how))
-        assert (found[seen[1]] == 0).all() and (found[seen.any(axis=0) & ~seen[1]] > 0).all()
+        result = array_of(mph.backproject(images, views, grid, how))
+        assert (result[seen[1]] == 0).all() and (result[seen.any(axis=0) & ~seen[1]] > 0).all()
         assert not array_of(mph.backproject(0 * images, views, grid, how)).any()
 
 
@@ -170,12 +166,11 @@ def test_a_depth_distribution_says_where_along_the_ray(rng, grid, parallel, how)
             value, within = sampled(image.T[..., None] * array, p[:, :3] / p[:, [3, 3, 4]])
             values.append(value)
             seen.append(within & (p[:, 3] > 0) & (p[:, 4] > 0))
-        found = array_of(mph.backproject(images, views, lattice, how, depth=pairs))
-        expected = put_together(np.array(values), np.array(seen), how)
-        assert np.isclose(found, expected, atol=1e-4).mean() > 0.9995
-        np.testing.assert_array_equal(
-            array_of(mph.backproject(images, views, lattice, how, depth=pairs.__getitem__)), found
+        result, same = (
+            array_of(mph.backproject(images, views, lattice, how, depth=depth)) for depth in (pairs, pairs.__getitem__)
         )
+        assert np.isclose(result, put_together(np.array(values), np.array(seen), how), atol=1e-4).mean() > 0.9995
+        np.testing.assert_array_equal(same, result)
 
 
 @pytest.mark.parametrize("how", WAYS)
@@ -192,52 +187,28 @@ def test_what_is_at_hand_is_memory_enough(scanner):
     """Besides images and result, a product takes less than half of the result's size, and the others nothing."""
     views, grid = scanner[:10].views((40, 40)), mph.Grid.centered((96, 96, 64), 1.5)
     images = np.ones((10, 40, 40), np.float32)
-    volume = 4 * grid.n_voxels
     for how, volumes in (("sum", 1), ("product", 1.5), ("minimum", 1)):
         tracemalloc.start()
         mph.backproject(images, views, grid, how)
         _, peak = tracemalloc.get_traced_memory()
         tracemalloc.stop()
-        assert peak < volumes * volume + 3e5
+        assert peak < volumes * 4 * grid.n_voxels + 3e5
 
 
 def test_it_says_how_far_it_is_and_can_be_stopped(rng, grid):
     views, images = odd_views(), rng.random((4, 23, 26))
     pairs = [(g, np.ones(g.shape)) for g in perspectives(views)]
-    for call in (
-        lambda progress: mph.backproject(images, views, grid, progress=progress),
-        lambda progress: mph.backproject(images, views, grid, depth=pairs, progress=progress),
-        lambda progress: mph.views_that_see(views, grid, progress),
-    ):
-        calls: list[float] = []
-        call(lambda done, total, calls=calls: calls.append(done / total))
-        assert calls == sorted(calls) and calls[-1] == 1 and len(calls) > 3
-
-        def stop(done: int, total: int) -> None:
-            raise mph.Cancelled
-
-        with pytest.raises(mph.Cancelled):
-            call(stop)
+    for depth in (None, pairs):
+        assert_progress(lambda p, depth=depth: mph.backproject(images, views, grid, depth=depth, progress=p), 4)
+    assert_progress(lambda progress: mph.views_that_see(views, grid, progress), 4)
 
 
 def test_tensors_are_taken_as_numbers(rng, grid):
     torch = pytest.importorskip("torch")
     views, images = odd_views(), rng.random((4, 23, 26))
-    found = mph.backproject(torch.from_numpy(images), views, grid, "product")
-    np.testing.assert_array_equal(found.array, mph.backproject(images, views, grid, "product").array)
-    refused(
-        lambda: mph.backproject(torch.from_numpy(images).requires_grad_(), views, grid), "gradients", "from_perspective"
-    )
-
-
-@pytest.mark.parametrize("name", ["b.nii.gz", "b.nrrd", "b.h5", "b.npz"])
-def test_files_keep_what_it_is(rng, grid, tmp_path, name):
-    views = odd_views()
-    volume = mph.backproject(rng.random((4, 23, 26)), views, grid)
-    mph.write_volume(volume, tmp_path / name)
-    read = mph.read_volume(tmp_path / name)
-    assert read.quantity == "backprojection"
-    np.testing.assert_array_equal(read.array, volume.array)
+    volume, tensors = mph.backproject(images, views, grid, "product"), torch.from_numpy(images)
+    np.testing.assert_array_equal(mph.backproject(tensors, views, grid, "product").array, volume.array)
+    refused(lambda: mph.backproject(tensors.requires_grad_(), views, grid), "gradients", "from_perspective")
 
 
 def test_what_is_not_understood_is_refused(rng, grid):
@@ -245,24 +216,27 @@ def test_what_is_not_understood_is_refused(rng, grid):
     negative, broken = images.copy(), images.copy()
     negative[2, 5, 7], broken[1, 2, 3] = -0.5, np.nan
     pairs = [(g, np.ones(g.shape)) for g in perspectives(views)]
-    below = [*pairs[:3], (pairs[3][0], -pairs[3][1])]
-    swapped = [pairs[1], pairs[0], *pairs[2:]]
-    refused(lambda: mph.backproject(images, views, grid, "mean"), "mean", "sum, product, minimum")
-    refused(lambda: mph.backproject(images[:3], views, grid), "4 x 23 x 26", "3 x 23 x 26")
-    refused(lambda: mph.backproject(broken, views, grid), "(1, 2, 3)", "finite")
-    refused(lambda: mph.backproject(negative, views, grid, "product"), "-0.5 at view 2, row 5, column 7")
-    mph.backproject(negative, views, grid, "sum")
-    mph.backproject(negative, views, grid, "minimum")
-    refused(lambda: mph.backproject(images, views, grid.affine), "expected a Grid or a PerspectiveGrid")
+    below, swapped = [*pairs[:3], (pairs[3][0], -pairs[3][1])], [pairs[1], pairs[0], *pairs[2:]]
+    for arguments, words in (
+        ((images, views, grid, "mean"), ("mean", "sum, product, minimum")),
+        ((images[:3], views, grid), ("4 x 23 x 26", "3 x 23 x 26")),
+        ((broken, views, grid), ("(1, 2, 3)", "finite")),
+        ((negative, views, grid, "product"), ("-0.5 at view 2, row 5, column 7",)),
+        ((images, views, grid.affine), ("expected a Grid or a PerspectiveGrid",)),
+        ((images, grid, grid), ("Views",)),
+    ):
+        refused(lambda arguments=arguments: mph.backproject(*arguments), *words)
+    for depth, words in (
+        (np.ones((4, 3)), ("a function or a list", "ndarray")),
+        (pairs[:3], ("each of 4 views", "3")),
+        ([array for _, array in pairs], ("view 0", "pair")),
+        (swapped, ("view 0", "of another")),
+        (below, ("view 3", "0 or more", "column 0, row 0, plane 0")),
+    ):
+        refused(lambda depth=depth: mph.backproject(images, views, grid, depth=depth), *words)
     refused(lambda: mph.views_that_see(views, (3, 3, 3)), "expected a Grid or a PerspectiveGrid")
-    refused(lambda: mph.backproject(images, grid, grid), "Views")
-    refused(lambda: mph.backproject(images, views, grid, depth=np.ones((4, 3))), "a function or a list", "ndarray")
-    refused(lambda: mph.backproject(images, views, grid, depth=pairs[:3]), "each of 4 views", "3")
-    refused(lambda: mph.backproject(images, views, grid, depth=[each for _, each in pairs]), "view 0", "pair")
-    refused(lambda: mph.backproject(images, views, grid, depth=swapped), "view 0", "of another")
-    refused(
-        lambda: mph.backproject(images, views, grid, depth=below), "view 3", "0 or more", "column 0, row 0, plane 0"
-    )
+    for how in ("sum", "minimum"):
+        mph.backproject(negative, views, grid, how)
 
 
 def derenzo_scores(system, pixels, spacing) -> dict[tuple[str, str], mph.DerenzoScore]:
@@ -271,15 +245,14 @@ def derenzo_scores(system, pixels, spacing) -> dict[tuple[str, str], mph.Derenzo
     grid, views = mph.Grid.centered((84, 84, 42), 1.0), system.views((pixels, pixels))
     truth = phantom.voxelize(mph.Grid.centered(np.rint(np.array([84, 84, 42]) / spacing), spacing))
     ideal = mph.Emission(system, hole="point", pixel_points=1, tolerance=1e9)
-    scores = {}
+    scores, settings = {}, {"recipe": {"model": {"kind": "emission"}}}
     for hole, model in (("ideal", ideal), ("real", mph.Emission(system))):
         counts = mph.Projector(truth.grid, views, model)(truth)
-        settings = {"recipe": {"model": {"kind": "emission"}}}
         images = mph.run_line_integrals(mph.ProjectionRun(counts, system, views, unit="counts", settings=settings))
         for how in WAYS:
-            found = mph.backproject(images, views, grid, how)
             # Scores are of activity; valley by peak asks for no unit.
-            scores[hole, how] = mph.derenzo_score(mph.Volume(found.array, grid), phantom)
+            activity = mph.Volume(mph.backproject(images, views, grid, how).array, grid)
+            scores[hole, how] = mph.derenzo_score(activity, phantom)
     return scores
 
 

@@ -121,17 +121,8 @@ def test_the_jacobian_is_that_of_central_differences(some, rng):
     system = some.replace(tilt=rng.normal(0, 0.02, (m, 3)))
     sd = np.array([5.0] * 3 + [0.03] * 3 + [1.0, 0.5, 0.5])
     seen = rng.normal(0, 5, (5, m, 2)), np.broadcast_to(np.eye(2), (5, m, 2, 2)), rng.uniform(size=(5, m)) < 0.8
-    bundle = BundleAdjustment(
-        system,
-        points_of(5),
-        True,
-        ("collimator_length", "detector_offset"),
-        sd,
-        *seen,
-        pairs,
-        np.array([30.0, 40]),
-        0.1,
-    )
+    fit, distances = ("collimator_length", "detector_offset"), np.array([30.0, 40])
+    bundle = BundleAdjustment(system, points_of(5), True, fit, sd, *seen, pairs, distances, 0.1)
     for each in (
         bundle,
         replace(bundle, fit=(), sd=sd[:6]),

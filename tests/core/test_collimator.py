@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 import mphdrr.core as mph
-from mphdrr.core.exchange import write_geometry
+from mphdrr.core.cli import main
 from mphdrr.core.geometry.checks.plates import needed_angle
 from mphdrr.core.geometry.collimator import Collimator, Construction
 from mphdrr.core.physics.aperture import KnifeEdge
@@ -35,10 +35,6 @@ class Rays:
 
     def __getitem__(self, chosen: np.ndarray) -> Rays:
         return Rays(self.source[:, chosen], self.target[:, chosen])
-
-    @property
-    def distance(self) -> np.ndarray:
-        return np.hypot(*self.crossing[:2])
 
     @property
     def on_crystal(self) -> np.ndarray:
@@ -80,7 +76,7 @@ def rays_of(rng, system, m: int) -> tuple[Rays, Rays]:
     direction = rng.normal(size=(3, N))
     direction[2] = -np.abs(direction[2])  # to the front, everywhere
     anywhere = Rays(target + 400 * direction / np.linalg.norm(direction, axis=0), target)
-    anywhere = anywhere[(anywhere.distance > 1.001 * d / 2) & (anywhere.source[2] < -20)]
+    anywhere = anywhere[(np.hypot(*anywhere.crossing[:2]) > 1.001 * d / 2) & (anywhere.source[2] < -20)]
     return through, Rays(*(np.concatenate(pair, axis=1) for pair in zip(
         (near.source, near.target), (anywhere.source, anywhere.target), strict=True)))  # fmt: skip
 
@@ -115,7 +111,7 @@ def assert_only_the_hole_is_open(through: Rays, past: Rays, cut) -> None:
 def test_every_roi_ray_passes_the_mesh_and_the_stl_file_through_the_hole_alone(scanner, tmp_path, rng, place):
     trimesh = pytest.importorskip("trimesh")
     chosen = scanner[::9]
-    write_geometry(chosen, tmp_path / "stl", "stl-parts", part="collimators", edge_at=place)
+    mph.write_geometry(chosen, tmp_path / "stl", "stl-parts", part="collimators", edge_at=place)
     parts = [p for p in chosen.parts(Construction(edge_at=place)) if p.kind == "collimator"]
     for m, part in enumerate(parts):
         read = trimesh.load(tmp_path / "stl" / f"{part.name}.stl")
@@ -164,16 +160,13 @@ class Convex:
         with np.errstate(divide="ignore", invalid="ignore"):
             roots = np.sort((-b + np.array([[-1], [1]]) * np.sqrt(np.maximum(under, 0))) / a, axis=0)
         # Within the ends the inside is one interval: where a > 0 between the roots, else beyond one of them.
-        ends = [np.concatenate([[low], roots.clip(low, high), [high]])][0]
-        best = np.full(len(low), np.inf), np.full(len(low), -np.inf)
-        for start, stop in pairwise(ends):
+        first, last = np.full(len(low), np.inf), np.full(len(low), -np.inf)
+        for start, stop in pairwise([low, *roots.clip(low, high), high]):
             t = (start + stop) / 2
             inside = (a * t * t + 2 * b * t + c <= 0) & (stop > start)
-            best = (
-                np.where(inside, np.minimum(best[0], start), best[0]),
-                np.where(inside, np.maximum(best[1], stop), best[1]),
-            )
-        return best
+            first = np.where(inside, np.minimum(first, start), first)
+            last = np.where(inside, np.maximum(last, stop), last)
+        return first, last
 
 
 def path_in_material(solid: Convex, air: list[Convex], rays: Rays) -> np.ndarray:
@@ -188,53 +181,49 @@ def path_in_material(solid: Convex, air: list[Convex], rays: Rays) -> np.ndarray
     return length * np.linalg.norm(target - source, axis=0)
 
 
-def gate9_solids(folder, system) -> dict[int, tuple[Convex, list[Convex]]]:
-    """For each module, from the macros: solid and air, in the module's frame."""
-    macros, found = Macros(folder), {}
-
-    def convex(volume, center) -> Convex:
-        if volume.shape == "trap":
-            sizes = volume.length("setDx1"), volume.length("setDx3"), 2 * volume.length("setDz")
-        else:
-            sizes = volume.length("setRmax1"), volume.length("setRmax2"), volume.length("setHeight")
-        return Convex(volume.shape == "cone", *sizes, center)
-
-    for name, volume in macros.volumes.items():
-        if not (name.startswith("collimator_")):
-            continue
-        air = [convex(v, v.centers[0]) for v in macros.volumes.values() if v.mother == name]
-        for center, frame in zip(volume.centers, volume.frames, strict=True):
-            m = int(np.argmin(np.linalg.norm(system.centers - center, axis=1)))
-            place = world_to_module(system, m, center) * [1, 1, -1]
-            np.testing.assert_allclose(frame, system.frames()[m], atol=1e-6)
-            found[m] = convex(volume, place), air
-    return found
+Solids = dict[int, tuple[Convex, list[Convex]]]
 
 
-def gate10_solids(folder, system) -> dict[int, tuple[Convex, list[Convex]]]:
-    """The same from the script's numbers."""
-    volumes, found = json.loads((folder / "simulation.json").read_text())["volumes"], {}
+def solids_in_modules(system, volumes: list) -> Solids:
+    """Return each module's solid and the air in it. `volumes`: tuples (name, mother, is round, sizes, centres, frames)."""
+    air: dict[str, list[Convex]] = {}
+    for _, mother, round_, sizes, centers, _ in volumes:
+        air.setdefault(mother, []).append(Convex(round_, *sizes, centers[0]))
+    solids = {}
+    for name, _, round_, sizes, centers, frames in volumes:
+        if name.startswith("collimator_"):
+            for center, frame in zip(centers, frames, strict=True):
+                m = int(np.argmin(np.linalg.norm(system.centers - center, axis=1)))
+                np.testing.assert_allclose(frame, system.frames()[m], atol=1e-6)
+                place = world_to_module(system, m, np.asarray(center)) * [1, 1, -1]
+                solids[m] = Convex(round_, *sizes, place), air[name]
+    return solids
 
-    def convex(volume, center) -> Convex:
-        assert volume["shape"] in ("trd", "cone")
-        return Convex(volume["shape"] == "cone", *volume["size_mm"], center)
 
-    for volume in volumes:
-        if not volume["name"].startswith("collimator_"):
-            continue
-        air = [convex(v, v["centers_mm"][0]) for v in volumes if v["mother"] == volume["name"]]
-        for center, rotation in zip(volume["centers_mm"], volume["rotations"], strict=True):
-            m = int(np.argmin(np.linalg.norm(system.centers - center, axis=1)))
-            np.testing.assert_allclose(np.transpose(rotation), system.frames()[m], atol=1e-6)
-            found[m] = convex(volume, world_to_module(system, m, np.array(center)) * [1, 1, -1]), air
-    return found
+def gate9_solids(folder, system) -> Solids:
+    """Read the solids from the macros."""
+    return solids_in_modules(system, [
+        (name, v.mother, v.shape == "cone", v.sizes(), v.centers, v.frames)
+        for name, v in Macros(folder).volumes.items() if "collimator_" in name + v.mother
+    ])  # fmt: skip
+
+
+def gate10_solids(folder, system) -> Solids:
+    """Read the solids from the script's numbers."""
+    volumes = json.loads((folder / "simulation.json").read_text())["volumes"]
+    volumes = [v for v in volumes if "collimator_" in v["name"] + v["mother"]]
+    assert {v["shape"] for v in volumes} == {"trd", "cone"}
+    return solids_in_modules(system, [
+        (v["name"], v["mother"], v["shape"] == "cone", v["size_mm"], v["centers_mm"],
+         np.transpose(v["rotations"], (0, 2, 1))) for v in volumes
+    ])  # fmt: skip
 
 
 @pytest.mark.parametrize("place", PLACES)
 @pytest.mark.parametrize(("format", "read"), [("gate9", gate9_solids), ("gate10", gate10_solids)])
 def test_every_roi_ray_passes_the_solids_of_gate_through_the_hole_alone(scanner, tmp_path, rng, format, read, place):
     scanner = scanner[::4]
-    write_geometry(scanner, tmp_path / "gate", format, views=scanner.views((4, 4), "real"), edge_at=place)
+    mph.write_geometry(scanner, tmp_path / "gate", format, views=scanner.views((4, 4), "real"), edge_at=place)
     solids = read(tmp_path / "gate", scanner)
     assert sorted(solids) == list(range(len(scanner)))
     for m, (solid, air) in solids.items():
@@ -245,7 +234,7 @@ def test_every_roi_ray_passes_the_solids_of_gate_through_the_hole_alone(scanner,
 def test_the_path_through_the_drawn_plate_is_that_of_the_physics(scanner, tmp_path, rng):
     """Beside the rim, where a ray leaves the edge within the plate, GATE's solid attenuates it as `KnifeEdge` does."""
     mu, plate = 2.0, 6.0
-    write_geometry(
+    mph.write_geometry(
         scanner, tmp_path / "gate", "gate10", views=scanner.views((4, 4), "real"), plate_thickness=plate,
         wall_thickness=5.0, opening_degrees=80,
     )  # fmt: skip
@@ -283,17 +272,13 @@ def test_what_shades_the_roi_is_found_and_what_does_not_is_not(scanner):
     """The needed angle clears the hole for any plate; a degree less does not; a straight hole is open by 50 to 75 %."""
     scanner = scanner[::5]
     assert mph.check_geometry(scanner).vignetted == ()
-    needed = [
-        needed_angle(*x)
-        for x in zip(scanner.pinhole_distance, scanner.pinhole_diameter, scanner.roi_radius, strict=True)
-    ]
+    needed = list(map(needed_angle, scanner.pinhole_distance, scanner.pinhole_diameter, scanner.roi_radius))
     narrow = mph.check_geometry(scanner, opening_angle=math.radians(1), edge_at="front").vignetted
     assert [v.module for v in narrow] == scanner.numbers.tolist()
     assert [v.needed_angle for v in narrow] == pytest.approx(needed)
     assert 0.45 < min(v.open_share for v in narrow) < max(v.open_share for v in narrow) < 0.75
     for plate in (1.0, 10.0, 25.0):
-        report = mph.check_geometry(scanner, plate_thickness=plate, opening_angle=max(needed))
-        assert report.vignetted == ()
+        assert mph.check_geometry(scanner, plate_thickness=plate, opening_angle=max(needed)).vignetted == ()
     tight = mph.check_geometry(scanner, plate_thickness=25.0, opening_angle=max(needed) - math.radians(1)).vignetted
     assert 0 < len(tight) < len(scanner) and tight[0].open_share < 0.99
     assert "too thick for an opening angle of" in str(tight[0]) and not mph.check_geometry(scanner).messages()
@@ -316,16 +301,13 @@ def test_a_plate_that_photons_pass_is_found(scanner):
     hole = math.pi / 4 * d * (d + 2 / mu)
     assert report.thin_plates[0].transmission == pytest.approx(through)
     beside = (2 * (d / 2 + 1 + 2)) ** 2 - math.pi * (d / 2 + 1) ** 2
-    assert report.thin_plates[0].share == pytest.approx(
-        through * beside / hole, rel=0.15
-    )  # the front is a little wider
+    # The front is a little wider.
+    assert report.thin_plates[0].share == pytest.approx(through * beside / hole, rel=0.15)
     assert "lets" in str(report.thin_plates[0])
     assert mph.check_geometry(scanner, aperture_mu=mph.attenuation("tungsten", 140.5)).ok
 
 
 def test_command_names_plates_that_do_not_fit(workbook, tmp_path, capsys):
-    from mphdrr.core.cli import main
-
     tight = ["--opening-angle", "40", "--plate", "4", "--edge-at", "back"]
     assert main(["geometry", "check", str(workbook), *tight, "--strict"]) == 1
     out = capsys.readouterr().out

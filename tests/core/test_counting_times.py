@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import functools
+
 import numpy as np
 import pytest
 
 import mphdrr.core as mph
-from mphdrr.addon.cli import main
 from mphdrr.core.recording import recorded_warnings
-from mphdrr.core.runs.mosaic import caption
+from mphdrr.core.runs.mosaic import counts_caption
 
 from . import dicom_files
-from .conftest import BACKENDS, emission
+from .conftest import BACKENDS, emission, refused, warned
+from .test_counts_said import counted
 from .test_measured_counts import write_hdr
 
 TIMES = np.array([10.0, 20, 30, 45, 60, 600, 3600, 5, 7, 9, 11, 1200])
@@ -33,11 +35,8 @@ def test_a_points_counts_are_the_integral_of_its_activity(system, backend, hole)
     grid, views = mph.Grid.centered(3, 4.0 if hole == "auto" else 40.0), system.views((6, 6), "real")
     x = np.zeros(grid.shape)
     x[1, 1, 1] = 1e6
-    options = {
-        "hole": hole,
-        "aperture_points": 3 if hole == "rays" else None,
-        "pixel_points": None if hole == "auto" else 3,
-    }
+    rays, pixels = 3 if hole == "rays" else None, None if hole == "auto" else 3
+    options = {"hole": hole, "aperture_points": rays, "pixel_points": pixels}
     for name in ("Tc-99m", "Lu-177"):
         tc = mph.isotope(name)
         one = mph.Projector(grid, views, emission(system, isotope=tc, **options), backend)
@@ -56,51 +55,13 @@ def test_a_points_counts_are_the_integral_of_its_activity(system, backend, hole)
         np.testing.assert_allclose(subset(x), still(x)[subset.which], rtol=1e-6, atol=1e-9)
 
 
-def test_gradients_and_closed_forms_have_the_times(system, rng):
-    grid, views = mph.Grid.centered(5, 10.0), system.views((6, 6), "real")
-    tc = mph.isotope("Tc-99m")
-    factors = (decays(tc) / tc.mean_decay_time(1.0))[:, None, None]
-    x, y = rng.uniform(0, 1, grid.shape), rng.uniform(0, 1, (12, 6, 6))
-    one, all_of = (mph.Emission(system, isotope="Tc-99m", **times) for times in ({}, BOTH))
-    A, B = (mph.Projector(grid, views, model, double=True) for model in (one, all_of))
-    for found, expected in zip(mph.geometry_gradient(B, x, y), mph.geometry_gradient(A, x, factors * y), strict=True):
-        np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9 * np.abs(expected).max())
-    points = rng.uniform(-20, 20, (2, 3))
-    images, plain = (mph.point_images(model, views, points) for model in (all_of, one))
-    np.testing.assert_allclose(images, factors * plain, rtol=1e-12)
-
-
-def test_noise_free_mlem_returns_the_volume_of_the_reference_time(system, rng):
-    grid, views = mph.Grid.centered(6, 12.0), system.views((8, 8), "real")
-    A = mph.Projector(grid, views, emission(system, isotope="Tc-99m", **BOTH))
-    truth = rng.uniform(10, 50, grid.shape).astype(np.float32)
-    with recorded_warnings() as texts:
-        found = mph.mlem(A, A(truth), 2, start=truth)
-    assert not texts
-    np.testing.assert_allclose(found.volume.array, truth, rtol=1e-5)
-
-
-@pytest.mark.parametrize(
-    "wrong, said",
-    [
-        ({"time": [1.0] * 11}, "time: expected one number, or 12 numbers .one for each view., got 11"),
-        ({"time": [1.0] * 11 + [0.0]}, "time: expected more than 0 s, got 0"),
-        ({"start": [np.nan] * 12}, "start: nan is not a finite number"),
-        ({"start": np.zeros((12, 2))}, "start: expected one number, or 12 numbers .*got 12 x 2"),
-    ],
-)
-def test_what_are_no_times_is_refused(system, wrong, said):
-    with pytest.raises(mph.InputError, match=said):
-        mph.Emission(system, **wrong)
-
-
 SMALL = {
     "phantom.text": "[[shape]]\nkind = 'sphere'\nradius = 30\nactivity = 5\n", "phantom.voxels": 8, "model.kind": "emission",
     "model.isotope": "Tc-99m", "detector.plane": "real", "detector.rows": 4, "detector.columns": 6,
 }  # fmt: skip
 
 
-def test_recipes_and_runs_have_them(system, workbook, tmp_path):
+def test_recipes_and_runs_have_them(system, workbook, tmp_path, command):
     given = {"model.time": TIMES.tolist(), "model.start": ", ".join(map(str, STARTS))}
     recipe = mph.Recipe(SMALL | given)
     assert recipe["model.time"] == tuple(TIMES) and recipe["model.start"] == tuple(STARTS)
@@ -117,24 +78,15 @@ def test_recipes_and_runs_have_them(system, workbook, tmp_path):
         A = mph.projector_of_run(again, again.volume.grid)
         np.testing.assert_array_equal(A(again.volume), again.projections)
     assert mph.Recipe(SMALL | {"model.time": [60.0]})["model.time"] == 60.0
-    with pytest.raises(mph.InputError, match="time: expected one number, or 3 numbers"):
-        next(mph.run_recipe(recipe, system[:3]))
-    with pytest.raises(mph.InputError, match=r"model.time: expected a number above 0 \(s\), got -1"):
-        mph.Recipe(SMALL | {"model.time": [1.0, -1.0]})
-    output = tmp_path / "b.h5"
-    command = ["project", "--time", "10,20", str(workbook), "--modules", "2,5", "--emission", "--start-time", "0, 3600"]
-    assert main([*command, "--size", "4", "4", "--voxels", "8", "-o", str(output)]) == 0
-    assert (
-        mph.read_run(output).recipe.given | {"model.time": (10.0, 20.0), "model.start": (0.0, 3600.0)}
-        == mph.read_run(output).recipe.given
-    )
+    refused(lambda: next(mph.run_recipe(recipe, system[:3])), "time: expected one number, or 3 numbers")
+    refused(lambda: mph.Recipe(SMALL | {"model.time": [-1.0]}), "model.time: expected a number above 0 (s), got -1")
+    given = ["--time", "10,20", "--modules", "2,5", "--emission", "--size", "4", "4", "--voxels", "8"]
+    command("project", workbook, *given, "--start-time", "0, 3600", "-o", tmp_path / "b.h5")
+    recipe = mph.read_run(tmp_path / "b.h5").recipe
+    assert recipe["model.time"] == (10.0, 20.0) and recipe["model.start"] == (0.0, 3600.0)
 
 
 # Measured files
-
-
-def counted(rng, shape=(12, 6, 6), mean=9.0) -> np.ndarray:
-    return rng.poisson(mean, shape).astype(np.uint16)
 
 
 def write_phases(frames, path, times, delays, **changes):
@@ -160,7 +112,7 @@ def test_dicoms_phases_say_when_frames_began_and_how_long_they_took(system, rng,
     run = mph.counts_run(mph.read_counts(path), system, "112-101", "back-v")
     np.testing.assert_allclose(run.recipe["model.time"], times[::-1])
     np.testing.assert_allclose(run.recipe["model.start"], begun[::-1])
-    assert "10 to 21 s" in caption(run)
+    assert "10 to 21 s" in counts_caption(run)
     recipe = mph.Recipe({
         "counts.files": [str(path)], "counts.frames": "112-101", "counts.orientation": "back-v", "model.kind": "emission",
         "model.start": 3600.0, "model.isotope": "Tc-99m",
@@ -201,16 +153,10 @@ def test_frames_of_a_phase_follow_each_other(rng, tmp_path):
     parts = [Dataset(), Dataset()]
     for part, duration, count in zip(parts, (10_000, 30_000), (2, 1), strict=True):
         part.ActualFrameDuration, part.NumberOfFramesInPhase, part.PauseBetweenFrames = duration, count, 500
-    path = tmp_path / "d.dcm"
-    vectors = {
-        "PhaseVector": [1, 1, 1, 1, 2, 2],
-        "TimeSliceVector": [1, 2, 1, 2, 1, 1],
-        "DetectorVector": [1, 1, 2, 2, 1, 2],
-    }
-    dicom_files.write_frames(
-        counted(rng, (6, 4, 4)), path, PhaseInformationSequence=parts, AcquisitionTime="101500.5", **vectors
-    )
-    about = mph.read_counts(path).about
+    tags = {"PhaseVector": [1, 1, 1, 1, 2, 2], "TimeSliceVector": [1, 2, 1, 2, 1, 1]}
+    tags |= {"DetectorVector": [1, 1, 2, 2, 1, 2], "PhaseInformationSequence": parts, "AcquisitionTime": "101500.5"}
+    dicom_files.write_frames(counted(rng, (6, 4, 4)), tmp_path / "d.dcm", **tags)
+    about = mph.read_counts(tmp_path / "d.dcm").about
     np.testing.assert_allclose(about[:, 0], [10, 10, 10, 10, 30, 30])
     np.testing.assert_allclose(about[:, 4], [0, 10.5, 0, 10.5, 20.5, 20.5])
 
@@ -247,21 +193,17 @@ def test_what_contradicts_a_file_is_refused(system, rng, tmp_path):
     path, times, begun = tmp_path / "c.hdr", np.arange(10, 22), 100 * np.arange(12)
     interfile(rng, path, times, begun)
     counts = mph.read_counts(path)
-
-    def refused(said, **given):
-        with pytest.raises(mph.InputError, match=said) as error:
-            mph.counts_run(counts, system, "112-101", "back-v", **given)
-        assert "\n" not in str(error.value)
-
-    wrong = times[::-1] + np.where(np.arange(12) == 9, 1.0, 0.0)
-    refused(r"c.hdr: frame 3 \(module 110\): the file says 12 s, the time \(--time\) is 13 s; leave it out", time=wrong)
-    refused(
-        r"frame 12 \(module 101\): the file says 21 s, the time .* is 10 s, and others of 10 frames more;", time=10.0
-    )
-    refused(
-        r"frame 12 \(module 101\): the file says 1100 s after frame 1 \(module 112\), the starts .* 1150 s; give that of",
-        start=begun[::-1] + np.where(np.arange(12) == 0, 50.0, 0.0),
-    )
+    late, long = (np.where(np.arange(12) == k, seconds, 0.0) for k, seconds in ((0, 50.0), (9, 1.0)))
+    for given, place, said in (
+        ({"time": times[::-1] + long}, "c.hdr: frame 3 (module 110)", "12 s, the time (--time) is 13 s; leave it out"),
+        ({"time": 10.0}, "frame 12 (module 101)", "21 s, the time .* is 10 s, and others of 10 frames more;"),
+        (
+            {"start": begun[::-1] + late}, "frame 12 (module 101)",
+            r"1100 s after frame 1 \(module 112\), the starts .* 1150 s; give that of",
+        ),
+    ):  # fmt: skip
+        call = functools.partial(mph.counts_run, counts, system, "112-101", "back-v", **given)
+        refused(call, f"{place}: the file says", said)
     run = mph.counts_run(counts, system, "112-101", "back-v", times[::-1] * 1.0001, start=60.0 + begun[::-1])
     assert run.recipe["model.start"][0] == 1160.0
     plain = mph.counts_run(np.asarray(counts), system, "101-112", "back-v", 30.0, start=60.0)
@@ -274,20 +216,12 @@ def test_a_time_that_only_some_frames_have_is_asked_for(system, rng, tmp_path):
     text = (tmp_path / "1.hdr").read_text()
     (tmp_path / "1.hdr").write_text("\n".join(line for line in text.splitlines() if "time per projection" not in line))
     counts = mph.read_counts([tmp_path / "0.hdr", tmp_path / "1.hdr"])
-    with pytest.raises(
-        mph.InputError, match=r"frame 6 \(module 106\): the file says no time, of others it does; say it"
-    ):
-        mph.counts_run(counts, system, "101-112", "back-v")
-    assert mph.counts_run(counts, system, "101-112", "back-v", 600.0).recipe["model.time"] == 600.0
+    call = functools.partial(mph.counts_run, counts, system, "101-112", "back-v")
+    refused(call, "frame 6 (module 106): the file says no time, of others it does; say it")
+    assert call(600.0).recipe["model.time"] == 600.0
 
 
 # Dead and hot
-
-
-def warned(call) -> list[str]:
-    with recorded_warnings() as texts:
-        call()
-    return texts
 
 
 FRAMES = {"frames": "112-101", "orientation": "front+u"}

@@ -12,13 +12,8 @@ import mphdrr.core as mph
 from mphdrr.core.recording import recorded_warnings
 
 from . import dicom_files
+from .conftest import refused, warned
 from .test_measured_counts import write_hdr, write_mhd
-
-
-def warned(call) -> list[str]:
-    with recorded_warnings() as texts:
-        call()
-    return texts
 
 
 def counted(rng, shape=(12, 6, 6), mean=9.0) -> np.ndarray:
@@ -29,18 +24,14 @@ def both_ways(system, path, frames, orientation, time, **more) -> list[str]:
     """The warnings of `read_counts` and `counts_run`, after those of the recipe were seen to be the same."""
     recipe = mph.Recipe(
         {
-            "counts.files": [str(path)] if not isinstance(path, list) else list(map(str, path)),
-            "counts.frames": frames,
-            "counts.orientation": orientation,
-            "model.kind": "emission",
-            "model.time": time,
+            "counts.files": list(map(str, path if isinstance(path, list) else [path])), "counts.frames": frames,
+            "counts.orientation": orientation, "model.kind": "emission", "model.time": time,
         }
         | ({"detector.pitch": more["pitch"]} if "pitch" in more else {})
-    )
+    )  # fmt: skip
     of_recipe = warned(lambda: next(mph.run_recipe(recipe, system)))
     own = warned(lambda: mph.counts_run(mph.read_counts(path), system, frames, orientation, time, **more))
     assert own == of_recipe
-    assert not any("\n" in text for text in own)
     return own
 
 
@@ -50,9 +41,7 @@ def test_the_files_time_and_pixels_reach_the_run_by_either_way(system, rng, tmp_
     dicom_files.write_frames(counted(rng), path, 90_000, PixelSpacing=["2.5", "2.5"])
     (pixels,) = both_ways(system, path, "101-112", "back-v", 90.0)
     own = side[np.abs(side / 6 - 2.5) > 2.5e-3][0] / 6
-    assert pixels.startswith(
-        f"nm.dcm: the file says pixels of 2.5 x 2.5 mm; taken as {own:.4g} x {own:.4g} mm, so that"
-    )
+    assert pixels.startswith(f"nm.dcm: the file says pixels of 2.5 x 2.5 mm; taken as {own:.4g} x {own:.4g} mm, so")
     of_side, other = both_ways(system, path, "101-112", "back-v", 90.0, pitch=3.0)
     assert of_side.startswith("6 pixels of 3 mm are 18 mm")
     assert other.endswith("pixels of 2.5 x 2.5 mm; taken as 3 x 3 mm, as given")
@@ -60,11 +49,8 @@ def test_the_files_time_and_pixels_reach_the_run_by_either_way(system, rng, tmp_
     assert of_side.startswith("6 pixels of 2.5 mm are 15 mm")
     with recorded_warnings():
         assert mph.counts_run(mph.read_counts(path), system, "101-112", "back-v").recipe["model.time"] == 90.0
-    contradicts = (
-        r"nm.dcm: frame 1 \(module 101\): the file says 90 s, the time \(--time\) is 30 s, and others of 11 frames more"
-    )
-    with pytest.raises(mph.InputError, match=contradicts):
-        both_ways(system, path, "101-112", "back-v", 30.0)
+    contradicts = "frame 1 (module 101): the file says 90 s, the time (--time) is 30 s, and others of 11 frames more"
+    refused(lambda: both_ways(system, path, "101-112", "back-v", 30.0), contradicts)
 
 
 @pytest.mark.parametrize("word", ["back-v", "front+u", "back-u", "front+v"])

@@ -1,7 +1,5 @@
 """Laws of the crystal: how much is absorbed, how deep, and at which position it is recorded."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -32,22 +30,18 @@ def test_layers_absorb_what_the_crystal_absorbs_as_deep(n, mu):
 def test_parallax_shifts_a_point_outwards_by_its_mean_depth(mu, detector):
     """Recorded at (l + z) tan(psi), z the mean depth of absorption along its direction; no count is gained or lost."""
     system = one_module()
-    place = np.array([0.0, 70.0, 0.0])
-    tangent = 70 / 200
-    cosine = 1 / np.hypot(1, tangent)
-    k, thickness = mu / cosine, 10.0
+    place, tangent = np.array([0.0, 70.0, 0.0]), 70 / 200
+    k, thickness = mu * np.hypot(1, tangent), 10.0
     depth = 1 / k - thickness / np.expm1(k * thickness)
+    scale = 1.0 if detector == "real" else -10.0
+    u, pitch = system.frames()[0, 0] @ place / 200 * 60 * scale, 0.04 * abs(scale)
+    grid, views = turned_grid((3, 3, 3), 0.7, place), system.views((60, 400), detector, pitch=pitch, offset=(-u, 0.0))
 
     def radius_and_counts(layers):
-        grid = turned_grid((3, 3, 3), 0.7, place)
-        side = 1.0 if detector == "real" else -10.0
-        u = system.frames()[0, 0] @ place / 200 * 60 * side
-        options = {"pitch": 0.04 * abs(side), "offset": (-u, 0.0)}
-        views = system.views((60, 400), detector, **options)
         model = emission(system, crystal_mu=mu, depth_layers=layers)
         image = mph.Projector(grid, views, model)(np.ones((3, 3, 3)))[0].astype(float)
-        columns = (np.arange(400) - 199.5) * options["pitch"] - u
-        return abs(columns @ image.sum(axis=0)) / image.sum() / abs(side), image.sum()
+        columns = (np.arange(400) - 199.5) * pitch - u
+        return abs(columns @ image.sum(axis=0)) / image.sum() / abs(scale), image.sum()
 
     radius, counts = radius_and_counts(1)
     assert radius == pytest.approx(60 * tangent, abs=0.01)
@@ -62,7 +56,6 @@ def test_thin_layers_blur_like_the_exponential():
     system, mu = one_module(), 0.26
     sharp, places = spot_image(emission(system, crystal_mu=mu), (0, 70, 0), pitch=0.05, n=200)
     deep, _ = spot_image(emission(system, crystal_mu=mu, depth_layers=12), (0, 70, 0), pitch=0.05, n=200)
-
     tangent, z = 70 / 200, np.linspace(0, 10, 100_001)
     density = np.exp(-mu * np.hypot(1, tangent) * z)
     density /= density.sum()

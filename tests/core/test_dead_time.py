@@ -7,6 +7,8 @@ from scipy.special import lambertw
 import mphdrr.core as mph
 from mphdrr.core.physics.dead_time import live_shares
 
+from .conftest import refused
+
 KINDS = ["non-paralysable", "paralysable"]
 ACTIVE = {
     "phantom.text": "[[shape]]\nkind = 'sphere'\nradius = 30\nactivity = 5\n", "phantom.voxels": 8, "phantom.spacing": 10.0,
@@ -22,9 +24,8 @@ def test_counters_record_by_the_law_and_back(kind):
     law = rates / (1 + rates * tau) if kind == "non-paralysable" else rates * np.exp(-rates * tau)
     np.testing.assert_allclose(recorded, law, rtol=1e-12)
     back = mph.dead_time_corrected(recorded * time, time, tau, kind) / time
-    near = rates * tau > 0.999  # of the maximum, which is flat: the square root of the rounding
-    np.testing.assert_allclose(back[~near], rates[~near], rtol=1e-9)
-    np.testing.assert_allclose(back[near], rates[near], rtol=1e-6)
+    tolerance = np.where(rates * tau > 0.999, 1e-6, 1e-9)  # the maximum is flat: the square root of the rounding
+    assert (np.abs(back - rates) <= tolerance * rates).all()
 
 
 def test_a_paralysable_rate_is_lamberts_function_of_what_is_recorded():
@@ -47,15 +48,12 @@ def test_a_module_is_busy_as_a_whole(kind, rng):
 
 def test_what_no_counter_records_is_refused():
     for kind, most in (("non-paralysable", 1e6), ("paralysable", 1e6 / np.e)):
-        with pytest.raises(
-            mph.InputError, match=f"at index 1, but a {kind} counter that is busy for 1e-06 s records at most"
-        ):
-            mph.dead_time_corrected([1.0, 1.01 * most], 1.0, 1e-6, kind)
-    for bad in ([[-1.0], 1.0, 1e-6], [[1.0], 0.0, 1e-6], [[1.0], 1.0, -1e-6], [[1.0, 2.0], [1.0] * 3, 1e-6]):
-        with pytest.raises(mph.InputError):
-            mph.dead_time_counts(*bad)
-    with pytest.raises(mph.InputError, match="kind 'both': expected one of non-paralysable, paralysable"):
-        mph.dead_time_counts([1.0], 1.0, 1e-6, "both")
+        words = f"at index 1, but a {kind} counter that is busy for 1e-06 s records at most"
+        refused(lambda m=most, k=kind: mph.dead_time_corrected([1.0, 1.01 * m], 1.0, 1e-6, k), words)
+    for counts, time, tau in (([-1.0], 1.0, 1e-6), ([1.0], 0.0, 1e-6), ([1.0], 1.0, -1e-6), ([1.0, 2.0], [1.0] * 3, 0)):
+        refused(lambda arguments=(counts, time, tau): mph.dead_time_counts(*arguments), "dead time: expected")
+    words = "kind 'both': expected one of non-paralysable, paralysable"
+    refused(lambda: mph.dead_time_counts([1.0], 1.0, 1e-6, "both"), words)
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -97,5 +95,5 @@ def test_a_paralysable_module_beyond_its_maximum_is_said(system):
     recipe = mph.Recipe(ACTIVE | {"model.dead_time": 1.5e6 / rate, "model.dead_time_kind": "paralysable"})
     with pytest.warns(mph.InputWarning, match="so many photons that more of them would be fewer counts, in module 10"):
         next(mph.run_recipe(recipe, system[:2]))
-    with pytest.raises(mph.InputError, match=r"model.dead_time_kind .* needs model.dead_time"):
-        mph.Recipe(ACTIVE | {"model.dead_time_kind": "paralysable"})
+    settings = ACTIVE | {"model.dead_time_kind": "paralysable"}
+    refused(lambda: mph.Recipe(settings), "model.dead_time_kind ", " needs model.dead_time")

@@ -8,8 +8,10 @@ from PIL import Image
 
 import mphdrr.core as mph
 from mphdrr.core.runs.display import COLORS, SCALES, Display
-from mphdrr.core.runs.letters import lettered, width
-from mphdrr.core.runs.mosaic import sheet, totals, write_png
+from mphdrr.core.runs.letters import text_ink, width
+from mphdrr.core.runs.mosaic import draw_sheet, image_totals, write_png
+
+from .conftest import refused
 
 numbers = st.lists(st.floats(-1e6, 1e6, width=32), min_size=2, max_size=30)
 
@@ -52,15 +54,14 @@ def test_numbers_outside_a_window_have_its_ends_colours_and_no_number_has_the_fi
     ],
 )
 def test_displays_that_cannot_be(settings, said):
-    with pytest.raises(mph.InputError, match=said):
-        Display(**settings)
+    refused(lambda: Display(**settings), said)
 
 
 @pytest.mark.parametrize(("shape", "factor"), [((70, 80), 1.0), ((20, 30), 3.0), ((200, 160), 0.5)])
 def test_every_image_stands_in_its_rings_row_as_the_pinhole_sees_it(shape, factor):
     rings = np.repeat([0, 1], [3, 5])
     images = np.random.default_rng(2).random((8, *shape), np.float32) * 70
-    drawn = sheet(images, np.arange(1, 9), rings, "counts", pixels=8 * 110 * 90)
+    drawn = draw_sheet(images, np.arange(1, 9), rings, "counts", pixels=8 * 110 * 90)
     assert drawn.window == (0.0, images.max()), "the bar's upper end is the largest exact number"
     assert drawn.tile == (shape[0] * factor, shape[1] * factor)
     rows, columns = drawn.corners.T
@@ -77,7 +78,7 @@ def test_every_image_stands_in_its_rings_row_as_the_pinhole_sees_it(shape, facto
 
 def has_ink(picture, text, size):
     """Whether a text stands somewhere in a picture, in white on something dark."""
-    ink, _ = lettered(text, size)
+    ink, _ = text_ink(text, size)
     windows = np.lib.stride_tricks.sliding_window_view(picture.min(axis=2), ink.shape)
     return bool(((windows[..., ink > 0.9] > 220).all(axis=-1) & (windows[..., ink < 0.2] < 160).all(axis=-1)).any())
 
@@ -85,10 +86,10 @@ def has_ink(picture, text, size):
 @pytest.mark.parametrize("unit", ["counts", "photons", "kBq/mL mm", "1"])
 def test_every_image_has_its_sum_or_mean_and_the_bar_the_largest_number(unit):
     images = 2 * np.random.default_rng(3).random((3, 128, 128), np.float32)
-    word, values = totals(images, unit)
+    word, values = image_totals(images, unit)
     assert word == ("sum" if unit in ("counts", "photons") else "mean")
     np.testing.assert_allclose(values, [getattr(image.astype(float), word)() for image in images], rtol=1e-12)
-    drawn, size = sheet(images, [1, 2, 3], [0, 0, 0], unit), 128 / 5.5
+    drawn, size = draw_sheet(images, [1, 2, 3], [0, 0, 0], unit), 128 / 5.5
     texts = [f"{word} {value:.4g}" for value in values]
     small = min(0.7 * size, 128 / max(width(text, 1.05) for text in texts))
     for (row, column), text in zip(drawn.corners, texts, strict=True):
@@ -106,30 +107,29 @@ def test_the_central_half_is_shown_with_its_own_totals_in_the_window_of_all(shap
     display = Display(half=True)
     assert np.array_equal(display.part(images), middle)
     assert np.array_equal(display.part(images[:, ::-1, ::-1]), middle[:, ::-1, ::-1]), "seen from any side"
-    drawn, own = sheet(images, [1, 2], [0, 0], "counts", display), Display(high=50.0)
+    drawn, own = draw_sheet(images, [1, 2], [0, 0], "counts", display), Display(high=50.0)
     assert drawn.window == (0.0, 50.0), "the largest of all exact numbers"
-    np.testing.assert_array_equal(
-        drawn.picture[:, :-200], sheet(middle, [1, 2], [0, 0], "counts", own).picture[:, :-200]
-    )
+    expected = draw_sheet(middle, [1, 2], [0, 0], "counts", own).picture
+    np.testing.assert_array_equal(drawn.picture[:, :-200], expected[:, :-200])
     np.testing.assert_allclose(drawn.totals, middle.sum(axis=(1, 2), dtype=float))
 
 
 def test_images_too_small_for_a_total_have_none():
     images = np.zeros((2, 64, 64), np.float32)
     images[0, 20, 20] = 123456.0
-    drawn = sheet(images, [1, 2], [0, 0], "counts")
+    drawn = draw_sheet(images, [1, 2], [0, 0], "counts")
     (row, column) = drawn.corners[1]
     assert not (drawn.picture[row + 20 : row + 64, column : column + 64] == 255).any()
 
 
 def test_a_run_without_counts_can_be_shown(tmp_path):
-    drawn = sheet(np.zeros((1, 8, 8), np.float32), [1], [0], "counts", Display(scale="log"))
+    drawn = draw_sheet(np.zeros((1, 8, 8), np.float32), [1], [0], "counts", Display(scale="log"))
     write_png(drawn.picture, tmp_path / "a.png")
     np.testing.assert_array_equal(np.asarray(Image.open(tmp_path / "a.png")), drawn.picture)
 
 
 def test_letters_are_told_apart():
-    pictures = {text: lettered(text, 11)[0].tobytes() for text in "0123456789.-+ekBqmLcounts/"}
+    pictures = {text: text_ink(text, 11)[0].tobytes() for text in "0123456789.-+ekBqmLcounts/"}
     assert len(set(pictures.values())) == len(pictures)
-    unknown, question = (lettered(text, 20)[0] for text in "€?")
+    unknown, question = (text_ink(text, 20)[0] for text in "€?")
     np.testing.assert_array_equal(unknown, question)

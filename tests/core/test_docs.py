@@ -6,8 +6,6 @@ else. A block that cannot run has a comment before it in its page, ``<!-- not ru
 notebook's page is test_notebook's.
 """
 
-from __future__ import annotations
-
 import contextlib
 import re
 import shlex

@@ -8,14 +8,13 @@ import numpy as np
 import pytest
 
 import mphdrr.core as mph
-from mphdrr.addon.cli import main
 
-from .conftest import BACKENDS, emission
+from .conftest import BACKENDS, emission, refused, refused_command
+from .test_counting_times import BOTH, decays
 
 
 @pytest.fixture
 def few(system):
-    """Five of the modules."""
     return system[:5]
 
 
@@ -86,19 +85,21 @@ def test_gradients_are_weighted(few, forms, rng, hole):
     assert (gradients(A, y)[1] * step).sum() == pytest.approx(slope, rel=1e-5)
 
 
-def test_the_geometrys_gradient_is_weighted(few, forms, rng):
+def test_the_geometrys_gradient_and_closed_forms_are_weighted(few, forms, rng):
+    """By efficiencies, and by what decays during each module's time."""
     grid, views = mph.Grid.centered(6, 10.0), few.views((4, 6), "real")
-    x, y = rng.uniform(0, 1, grid.shape), rng.uniform(0, 1, (len(few), 4, 6))
-    options = {"intrinsic_fwhm": 3.0}
-    bare = mph.Projector(grid, views, mph.Emission(few, **options), double=True)
-    for efficiency in forms:
-        A = mph.Projector(grid, views, mph.Emission(few, efficiency=efficiency, **options), double=True)
-        found, expected = mph.geometry_gradient(A, x, y), mph.geometry_gradient(bare, x, each(efficiency) * y)
-        for one, other in zip(found, expected, strict=True):
-            np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-12 * np.abs(other).max())
-    points = rng.uniform(-20, 20, (2, 3))
-    images, plain = (mph.point_images(of.model, views, points) for of in (A, bare))
-    np.testing.assert_allclose(images, each(efficiency) * plain, rtol=1e-12)
+    x, y, points = rng.uniform(0, 1, grid.shape), rng.uniform(0, 1, (len(few), 4, 6)), rng.uniform(-20, 20, (2, 3))
+    tc = mph.isotope("Tc-99m")
+    times = {name: values[:5] for name, values in BOTH.items()}
+    cases = [({"efficiency": efficiency}, efficiency) for efficiency in forms]
+    for changes, weights in (*cases, (times, decays(tc)[:5] / tc.mean_decay_time(1.0))):
+        models = [mph.Emission(few, isotope=tc, intrinsic_fwhm=3.0, **given) for given in ({}, changes)]
+        bare, A = (mph.Projector(grid, views, model, double=True) for model in models)
+        gradients = mph.geometry_gradient(A, x, y), mph.geometry_gradient(bare, x, each(weights) * y)
+        for gradient, expected in zip(*gradients, strict=True):
+            np.testing.assert_allclose(gradient, expected, rtol=1e-9, atol=1e-9 * np.abs(expected).max())
+        plain, images = (mph.point_images(model, views, points) for model in models)
+        np.testing.assert_allclose(images, each(weights) * plain, rtol=1e-12)
 
 
 @pytest.fixture
@@ -121,12 +122,12 @@ def test_dead_pixels_have_no_background(system, scan):
             np.testing.assert_allclose(points[0], expected)
 
 
-def test_noise_free_mlem_returns_the_same_volume_with_any_efficiency(system, scan, rng):
+def test_noise_free_mlem_returns_the_same_volume_with_any_efficiency_and_times(system, scan, rng):
     grid, views, truth = scan
     efficiency = rng.uniform(0.3, 1.7, (12, 8, 8))
     efficiency[rng.uniform(size=efficiency.shape) < 0.05] = 0
-    for value in (efficiency, rng.uniform(0.3, 1.7, 12)):
-        A = mph.Projector(grid, views, emission(system, time=600, background=1.0, efficiency=value))
+    for given in ({"efficiency": efficiency}, {"efficiency": rng.uniform(0.3, 1.7, 12)}, {"isotope": "Tc-99m", **BOTH}):
+        A = mph.Projector(grid, views, emission(system, background=1.0, **({"time": 600} | given)))
         counts = np.where(A.living, A(truth) + A.background, 1e6)  # dead pixels may say anything
         for method in (mph.mlem, mph.osem, mph.bsrem):
             found = method(A, counts, 2, start=truth).volume.array
@@ -153,17 +154,26 @@ def test_a_dead_module_is_one_that_is_not_there(system, scan, rng):
 
 
 @pytest.mark.parametrize(
-    "bad, said",
+    ("given", "said"),
     [
-        (-0.5, "efficiency: expected 0 or more, got -0.5"),
-        (np.inf, "efficiency: inf is not a finite number"),
-        (np.ones(5), "efficiency: expected one number, 12 numbers"),
-        (np.ones((3, 4, 6)), "efficiency: .* got 3 x 4 x 6"),
+        ({"background": -0.5}, "background: expected 0 or more, got -0.5"),
+        ({"background": np.nan}, "background: nan is not a finite number"),
+        ({"background": "much"}, "background: expected real numbers, got str 'much'"),
+        ({"background": np.ones(5)}, "background: expected one number, 12 numbers .one for .*, or 12 images, got 5"),
+        ({"background": np.ones((12, 4))}, "background: .* got 12 x 4"),
+        ({"background": np.ones((3, 4, 6))}, "background: .* got 3 x 4 x 6"),
+        ({"efficiency": -0.5}, "efficiency: expected 0 or more, got -0.5"),
+        ({"efficiency": np.inf}, "efficiency: inf is not a finite number"),
+        ({"efficiency": np.ones(5)}, "efficiency: expected one number, 12 numbers"),
+        ({"efficiency": np.ones((3, 4, 6))}, "efficiency: .* got 3 x 4 x 6"),
+        ({"time": [1.0] * 11}, "time: expected one number, or 12 numbers .one for each view., got 11"),
+        ({"time": [1.0] * 11 + [0.0]}, "time: expected more than 0 s, got 0"),
+        ({"start": [np.nan] * 12}, "start: nan is not a finite number"),
+        ({"start": np.zeros((12, 2))}, "start: expected one number, or 12 numbers .*got 12 x 2"),
     ],
 )
-def test_what_is_no_efficiency_is_refused(system, bad, said):
-    with pytest.raises(mph.InputError, match=said):
-        mph.Emission(system, efficiency=bad)
+def test_what_is_no_background_efficiency_or_time_is_refused(system, given, said):
+    refused(lambda: mph.Emission(system, **given), said)
 
 
 SMALL = {
@@ -202,8 +212,7 @@ def test_recipes_have_it_as_numbers_or_in_files(few, forms, tmp_path):
     with pytest.raises(mph.InputError, match="efficiency: expected one number, 3 numbers"):
         next(mph.run_recipe(mph.Recipe(SMALL | {"model.efficiency": [1.0] * 4}), few[:3]))
     for bad in ([], ["a.npy", 1.0], "much", [-1.0, 2.0]):
-        with pytest.raises(mph.InputError, match=r"model\.efficiency: expected a"):
-            mph.Recipe(SMALL | {"model.efficiency": bad})
+        refused(lambda bad=bad: mph.Recipe(SMALL | {"model.efficiency": bad}), r"model\.efficiency: expected a")
 
 
 def test_line_integrals_of_runs_know_it(few, forms):
@@ -277,9 +286,7 @@ def test_a_flood_tells_efficiencies_and_planted_pixels(rng):
         assert found.efficiency[m][lives].mean() == pytest.approx(1.0)
         off = found.efficiency[m][lives] / (own[m][lives] / own[m][lives].mean()) - 1
         assert off.std() < 1.15 / np.sqrt(700) and abs(off.mean()) < 0.005
-    assert str(found).startswith(
-        "4 modules of 40 x 40 pixels: 15 dead and 15 hot pixels, 1 dead modules; others vary by "
-    )
+    assert str(found).startswith("4 modules of 40 x 40 pixels: 15 dead and 15 hot pixels, 1 dead modules; others vary")
 
 
 @pytest.mark.parametrize("mean", [100.0, 3000.0])
@@ -289,38 +296,33 @@ def test_an_even_flood_has_no_dead_pixels(rng, mean):
 
 
 def test_what_is_no_flood_is_refused_and_too_few_counts_are_said(rng):
-    with pytest.raises(mph.InputError, match="flood: expected counts, 0 or more, got -1"):
-        mph.flood_efficiency(-np.ones((1, 4, 4)))
-    with pytest.raises(mph.InputError, match="flood: expected shape any x any x any"):
-        mph.flood_efficiency(np.ones((4, 4)))
-    with pytest.raises(mph.InputError, match="smooth_order"):
-        mph.flood_efficiency(np.ones((1, 4, 4)), -1)
+    refused(lambda: mph.flood_efficiency(-np.ones((1, 4, 4))), "flood: expected counts, 0 or more, got -1")
+    refused(lambda: mph.flood_efficiency(np.ones((4, 4))), "flood: expected shape any x any x any")
+    refused(lambda: mph.flood_efficiency(np.ones((1, 4, 4)), -1), "smooth_order")
     with pytest.warns(mph.InputWarning, match="too few to tell dead pixels"):
         mph.flood_efficiency(np.full((1, 8, 8), 3))
     assert mph.flood_efficiency(np.zeros((2, 4, 4))).dead_modules.tolist() == [0, 1]
 
 
-def test_the_command_writes_what_recipes_read(workbook, rng, tmp_path, capsys):
+def test_the_command_writes_what_recipes_read(workbook, rng, tmp_path, command):
     mean, _ = flood(rng, modules=3, n=16)
     mean[1, 3, 4], mean[2, 5, 6] = 0, 1e5
     np.save(tmp_path / "flood.npy", rng.poisson(mean).astype(np.int32))
     said = ["--modules", "2-4", "--frames", "4,3,2", "--orientation", "back-v", "--time", "60"]
-    run = str(tmp_path / "flood.h5")
-    assert main(["project", str(workbook), "--counts", str(tmp_path / "flood.npy"), *said, "-o", run]) == 0
-    assert main(["counts", "flood", run, "-o", str(tmp_path / "e.npy")]) == 0
-    printed = capsys.readouterr().out
+    run = tmp_path / "flood.h5"
+    command("project", workbook, "--counts", tmp_path / "flood.npy", *said, "-o", run)
+    printed = command("counts", "flood", run, "-o", tmp_path / "e.npy").out
     assert "dead: 3/4/5\n" in printed and "hot: 2/6/7\n" in printed
-    assert main(["counts", "flood", run, "-o", str(tmp_path / "again.npy"), "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["dead"] == [[3, 4, 5]]
+    answer = command("counts", "flood", run, "-o", tmp_path / "again.npy", "--json").out
+    assert json.loads(answer)["dead"] == [[3, 4, 5]]
     options = ["--modules", "2-4", "--emission", "--size", "16", "16", "--voxels", "8", "--detector", "real"]
-    output = tmp_path / "run.h5"
-    assert main(["project", str(workbook), *options, "--efficiency", str(tmp_path / "e.npy"), "-o", str(output)]) == 0
-    found = mph.read_run(output)
+    command("project", workbook, *options, "--efficiency", tmp_path / "e.npy", "-o", tmp_path / "run.h5")
+    found = mph.read_run(tmp_path / "run.h5")
     assert found.efficiency[1, 3, 4] == found.efficiency[0, 5, 6] == 0 and found.projections[1, 3, 4] == 0
 
 
 def test_floods_whose_modules_and_orientation_nobody_said_are_refused(tmp_path, capsys):
     """Another program's frames: a flood must be imported first."""
     (tmp_path / "flood.dcm").write_bytes(b"")
-    assert main(["counts", "flood", str(tmp_path / "flood.dcm"), "-o", str(tmp_path / "e.npy")]) == 1
-    assert "expected a name ending in .h5" in capsys.readouterr().err
+    said = refused_command(capsys, "counts", "flood", tmp_path / "flood.dcm", "-o", tmp_path / "e.npy")
+    assert "expected a name ending in .h5" in said

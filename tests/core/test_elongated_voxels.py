@@ -108,45 +108,6 @@ def test_a_slab_just_as_thick_as_a_derenzo_phantom_holds_it():
     assert total(without_warning(phantom, grid)) == pytest.approx(phantom.total_activity, rel=1e-4)
 
 
-@pytest.mark.parametrize(
-    "spacing",
-    [(0.5, 0.5, 12), (0.3, 60, 0.3), (12, 9, 0.2), (2, 0.7, 6)],
-    ids=lambda spacing: "x".join(map(str, spacing)),
-)
-def test_elongated_voxels_of_overlapping_boxes_hold_the_closed_form(spacing):
-    """Boxes along the voxels: one inside the other, one added across both, one over the corner of all."""
-    boxes = [  # low, high, activity
-        ((-11.3, -20.1, -14.2), (12.4, 19.7, 15.1), 2.0),
-        ((-5.2, -9.9, -8.4), (6.1, 11.2, 7.7), 9.0),
-        ((-30.3, -3.1, -1.7), (28.2, 2.2, 4.3), 3.0),
-        ((4.4, 8.3, 5.9), (20.2, 25.5, 22.8), 5.0),
-    ]
-    low, high = (np.array([box[i] for box in boxes]) for i in (0, 1))
-    shapes = [
-        mph.Box(size=b - a, position=(a + b) / 2, activity=box[2], mode="add" if i == 2 else "paint")
-        for i, (a, b, box) in enumerate(zip(low, high, boxes, strict=True))
-    ]
-    grid = mph.Grid.centered(np.ceil(66 / np.array(spacing)).astype(int), spacing, (0.3, -0.2, 0.4))
-    edges = [np.arange(n + 1) - 0.5 for n in grid.shape]
-    edges = [e * s + o for e, s, o in zip(edges, spacing, grid.affine[:3, 3], strict=True)]
-
-    def share(*numbers: int) -> np.ndarray:
-        """Of each voxel, what is in all of these boxes."""
-        a, b = low[list(numbers)].max(axis=0), high[list(numbers)].min(axis=0)
-        parts = [
-            np.clip(np.minimum(e[1:], y) - np.maximum(e[:-1], x), 0, None) for e, x, y in zip(edges, a, b, strict=True)
-        ]
-        return np.einsum("i,j,k->ijk", *parts) / grid.voxel_volume
-
-    expected = 2 * share(0) + 7 * share(0, 1) + 3 * share(2)  # box 1 lies in box 0
-    covered = 2 * share(0, 3) + 7 * share(0, 1, 3) + 3 * share(2, 3)
-    expected += 5 * share(3) - covered
-    volume = without_warning(mph.ShapePhantom(shapes), grid)
-    assert volume.array.sum() == pytest.approx(expected.sum(), rel=1e-3)
-    assert np.abs(volume.array - expected).max() < 0.04 * expected.max()
-    assert np.sqrt(np.mean((volume.array - expected)[expected > 0] ** 2)) < 0.004 * expected.max()
-
-
 @on_grids([KINDS[0], PAINTING, KINDS[1], KINDS[5]])
 def test_long_voxels_hold_their_mean(thing, grid, rng):
     pose = mph.euler_pose(0.4, 0.7, -1.1, (1, 2, -3))

@@ -14,24 +14,12 @@ from mphdrr.core.physics.crystal import gaussian_blur  # noqa: E402
 from mphdrr.core.projector.torch_cameras import emission_images  # noqa: E402
 
 from .conftest import BACKENDS, emission, general_grid, refused  # noqa: E402
+from .test_emission import mu_grids, some_mu  # noqa: E402
 
 
 def grid_of_mu(which, grid, rng):
     """The activity's grid, or one that is larger, coarser and rotated."""
-    if which == "shared":
-        return grid
-    affine = general_grid(rng, (5, 4, 6)).affine
-    affine = affine @ np.diag([2.5, 2.5, 2.0, 1.0])
-    affine[:3, 3] = -affine[:3, :3] @ [2.0, 1.5, 2.5]
-    return mph.Grid((5, 4, 6), affine)
-
-
-def some_mu(rng, grid):
-    """Between air and more than bone, with an empty margin and holes."""
-    array = rng.uniform(0, 0.05, grid.shape)
-    array[rng.random(grid.shape) < 0.3] = 0
-    array[0] = 0
-    return mph.Volume(array, grid, "mu")
+    return mu_grids(grid, rng)[("shared", "own").index(which)]
 
 
 def camera(system, m=3):
@@ -98,18 +86,6 @@ def test_backends_agree_on_gradients_by_mu(backend, which, system, rng):
         torch.testing.assert_close(gradient, reference, rtol=2e-5, atol=2e-5 * float(reference.abs().max()))
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
-def test_gradient_by_mu_in_closed_form(backend):
-    """Activity f in one voxel, matter in the voxels before it: f (1 - exp(-m s)) / m exp(-sum of mu s), s = 2 mm."""
-    grid = mph.Grid.centered((1, 1, 5), 2.0)
-    f, mu = torch.tensor([0, 0, 0, 3.0, 0]), torch.tensor([0.1, 0.0, 0.3, 0.2, 0.4], requires_grad=True)
-    line = mph.trace_rays(f.reshape(1, 1, 5), [0.1, 0.2, -50.0], [0.1, 0.2, 60.0], backend, grid, mu.reshape(1, 1, 5))
-    expected = 3 * (1 - torch.exp(-2 * mu[3])) / mu[3] * torch.exp(-2 * mu[:3].sum())
-    torch.testing.assert_close(line[0], expected, rtol=1e-5, atol=0, check_dtype=False)
-    (got,), (wanted,) = torch.autograd.grad(line.sum(), mu, retain_graph=True), torch.autograd.grad(expected, mu)
-    torch.testing.assert_close(got, wanted, rtol=1e-5, atol=1e-6)
-
-
 def test_what_is_no_mu_is_refused(system, rng):
     grid = general_grid(rng, (4, 3, 2))
     views, mu = system[:1].views((2, 2)), some_mu(rng, grid)
@@ -146,22 +122,13 @@ def test_images_are_those_of_the_projector(backend, which, system, rng):
     grid = general_grid(rng, (9, 8, 7))
     activity = mph.Volume(rng.random(grid.shape), grid, "activity")
     mu = which and some_mu(rng, grid_of_mu(which, grid, rng))
-    model = emission(
-        system,
-        mu,
-        time=20.0,
-        photons_per_decay=0.9,
-        aperture_points=4,
-        pixel_points=1,
-        aperture_mu=3.0,
-        crystal_mu=0.1,
-        intrinsic_fwhm=0.8,
-    )
+    same = {"time": 20.0, "photons_per_decay": 0.9, "aperture_points": 4, "pixel_points": 1, "crystal_mu": 0.1}
+    model = emission(system, mu, aperture_mu=3.0, intrinsic_fwhm=0.8, **same)
     poses = torch.tensor(system.poses())
     got = emission_images(
         activity, poses[:, :3, 3], poses[:, :3, :3], torch.tensor(system.collimator_length), [0.4, 0.6], (9, 8), [0.1, -0.2],
-        diameter=torch.tensor(model.effective_diameter), aperture_points=4, pixel_points=1, crystal_mu=0.1,
-        crystal_thickness=torch.tensor(system.detector_thickness), time=20.0, photons_per_decay=0.9, mu=mu, backend=backend,
+        diameter=torch.tensor(model.effective_diameter), crystal_thickness=torch.tensor(system.detector_thickness),
+        mu=mu, backend=backend, **same,
     ).numpy()  # fmt: skip
     along_v, along_u = (gaussian_blur(n, 0.8 / 2.35482 / pitch) for n, pitch in ((9, 0.6), (8, 0.4)))
     got = along_v @ got @ along_u.T

@@ -1,7 +1,5 @@
 """Scatter from energy windows: the estimate's laws, and files with frames of several windows."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -20,12 +18,12 @@ ORDER = {"counts.frames": "none*12, 101-112, none*12", "counts.lower_frames": "1
          "counts.upper_frames": "none*24, 101-112"}  # fmt: skip
 
 
-def continuum(shape, rng, edges=EDGES, falls_to=None):
-    """Counts in the windows of a continuum that is linear in energy, another one in each pixel."""
+def continuum(shape, rng, falls_to=None):
+    """Return counts in the windows of a continuum that is linear in energy, another one in each pixel."""
     height, slope = rng.uniform(2, 9, shape), rng.uniform(-0.03, 0.0, shape)
     if falls_to is not None:
         slope = -height / (falls_to - 140.0)
-    return [(high - low) * (height + slope * ((low + high) / 2 - 140.0)) for low, high in edges]
+    return [(high - low) * (height + slope * ((low + high) / 2 - 140.0)) for low, high in EDGES]
 
 
 def test_triple_windows_find_a_linear_continuum_exactly(rng):
@@ -54,24 +52,18 @@ def test_the_variance_is_that_of_draws(rng, fwhm):
     found, stated = mph.energy_window_scatter(*draws, WIDTHS, fwhm)
     spread = np.var(found, axis=0, ddof=1)
     assert stated.mean() == pytest.approx(spread.mean(), rel=0.05)
-    rows = [
-        stated.mean(axis=0)[where].mean() / spread[where].mean() for where in (np.s_[:2], np.s_[:, -2:], np.s_[3:6])
-    ]
-    np.testing.assert_allclose(rows, 1, rtol=0.05)  # at the edges, too
+    for part in (np.s_[:2], np.s_[:, -2:], np.s_[3:6]):  # at the edges, too
+        assert stated.mean(axis=0)[part].mean() == pytest.approx(spread[part].mean(), rel=0.05)
     expected, _ = mph.energy_window_scatter(*means, WIDTHS, fwhm)
     np.testing.assert_allclose(found.mean(axis=0), expected[0], atol=6 * np.sqrt(stated.mean() / 1000))
 
 
-def test_smoothing_leaves_what_is_even(rng):
-    even = np.full((2, 7, 9), 5.0)
-    found, variance = mph.energy_window_scatter(even, even, even, WIDTHS, 4.0)
-    np.testing.assert_allclose(found, 5 * 28 / 6, rtol=1e-12)
-    _, noisier = mph.energy_window_scatter(even, even, even, WIDTHS)
-    assert (variance < noisier / 4).all()
-
-
-def test_smoothing_knows_what_pixels_count(rng):
+def test_smoothing_leaves_what_is_even_and_knows_the_pixels_efficiencies(rng):
     """Even scatter on pixels of any efficiency is found exactly, whatever dead and hot ones hold."""
+    even = np.full((2, 7, 9), 5.0)
+    estimate, variance = mph.energy_window_scatter(even, even, even, WIDTHS, 4.0)
+    np.testing.assert_allclose(estimate, 5 * 28 / 6, rtol=1e-12)
+    assert (variance < mph.energy_window_scatter(even, even, even, WIDTHS)[1] / 4).all()
     efficiency = rng.uniform(0.5, 1.5, (2, 7, 9))
     lower = 5 * efficiency
     bad = rng.random(lower.shape) < 0.2
@@ -100,28 +92,24 @@ def test_no_window_no_width_and_no_counts_are_refused(rng):
         refused(lambda arguments=arguments: mph.energy_window_scatter(*arguments), *words)
 
 
-def windows_said(edges=EDGES):
-    """DICOM's tags of frames of three windows, 12 frames each."""
+def windows_said():
+    """Return DICOM's tags of frames of three windows, 12 frames each."""
     from pydicom.dataset import Dataset
 
-    found = []
-    for low, high in edges:
+    windows = []
+    for low, high in EDGES:
         window, span = Dataset(), Dataset()
         span.EnergyWindowLowerLimit, span.EnergyWindowUpperLimit = low, high
         window.EnergyWindowRangeSequence = [span]
-        found.append(window)
+        windows.append(window)
     vector = np.repeat([1, 2, 3], 12).tolist()
-    return {"EnergyWindowInformationSequence": found, "EnergyWindowVector": vector, "NumberOfEnergyWindows": 3}
+    return {"EnergyWindowInformationSequence": windows, "EnergyWindowVector": vector, "NumberOfEnergyWindows": 3}
 
 
 def recipe_of(path, **changes):
-    files = [str(path)] if not isinstance(path, list) else list(map(str, path))
-    return mph.Recipe(
-        {
-            "counts.files": files, "counts.orientation": "back-v", "model.time": 60.0, "model.kind": "emission",
-            **ORDER, **changes,
-        }
-    )  # fmt: skip
+    files = list(map(str, path if isinstance(path, list) else [path]))
+    settings = {"counts.files": files, "counts.orientation": "back-v", "model.time": 60.0, "model.kind": "emission"}
+    return mph.Recipe({**settings, **ORDER, **changes})
 
 
 @pytest.fixture
@@ -172,114 +160,95 @@ def test_one_recipe_imports_three_windows_and_reconstructions_expect_their_scatt
     np.testing.assert_allclose(more.background, run.background + 0.25, rtol=1e-6)
 
 
-def test_scatter_has_been_counted_with_the_dead_time_and_is_not_reduced_again(system, frames, tmp_path):
+def test_dead_time_is_that_of_all_windows_and_has_reduced_the_scatter_already(system, frames, tmp_path):
     np.save(tmp_path / "c.npy", frames)
-    given = {"counts.window_widths": WIDTHS, "model.dead_time": 500.0, "model.background": 2.0}
-    (run,) = mph.run_recipe(recipe_of(tmp_path / "c.npy", **given), system)
-    A = mph.projector_of_run(run, mph.Grid.centered(4, 30.0))
-    np.testing.assert_allclose(A.background, run.background, rtol=1e-6)
-    live = mph.projector_of_run(run, A.grid, recipe=run.recipe.updated({"model.background": 0.0}))
-    np.testing.assert_allclose(live.background, scatter_of(frames), rtol=1e-6)
-    assert (A.background < live.background + 2.0).all()
-
-
-def test_photons_of_all_windows_keep_a_module_busy(system, frames, tmp_path):
-    np.save(tmp_path / "c.npy", frames)
-    given = {"counts.window_widths": WIDTHS, "model.dead_time": 500.0}
-    (run,) = mph.run_recipe(recipe_of(tmp_path / "c.npy", **given), system)
+    settings = {"counts.window_widths": WIDTHS, "model.dead_time": 500.0, "model.background": 2.0}
+    (run,) = mph.run_recipe(recipe_of(tmp_path / "c.npy", **settings), system)
     mph.write_run(run, tmp_path / "run.h5")
     A = mph.projector_of_run(mph.read_run(tmp_path / "run.h5"), mph.Grid.centered(4, 30.0))
+    np.testing.assert_allclose(A.background, run.background, rtol=1e-6)
     busy = 500e-6 * frames.reshape(3, 12, -1).sum(axis=(0, 2), dtype=float) / 60.0
     np.testing.assert_allclose(A.model.efficiency, 1 - busy, rtol=1e-12)
+    without = mph.projector_of_run(run, A.grid, recipe=run.recipe.updated({"model.background": 0.0}))
+    np.testing.assert_allclose(without.background, scatter_of(frames), rtol=1e-6)
+    assert (A.background < without.background + 2.0).all()
 
 
-def test_scatter_is_smoothed_by_what_the_run_says_of_its_pixels(system, frames, tmp_path):
+def test_scatter_is_smoothed_by_what_the_run_says_of_its_pixels(system, frames):
     efficiency = np.ones((12, 6, 6))
     efficiency[2, 1, 4] = efficiency[7] = 0
     frames[2, 1, 4] = 60_000  # hot below the peak
+    arguments = (frames, system, ORDER["counts.frames"], "back-v", 60.0)
     windows = mph.ScatterWindows(ORDER["counts.lower_frames"], None, WIDTHS, 3.0)
-    given = {"scatter": windows, "efficiency": efficiency}
-    run = mph.counts_run(frames, system, ORDER["counts.frames"], "back-v", 60.0, **given)
+    run = mph.counts_run(*arguments, scatter=windows, efficiency=efficiency)
     assert run.background.max() < 4 * frames[:12][efficiency > 0].max()
-    upright = mph.counts_run(
-        frames, system, ORDER["counts.frames"], "back-v", 60.0, detector="virtual",
-        **given | {"efficiency": efficiency[:, ::-1, ::-1]},
-    )  # fmt: skip
+    upright = mph.counts_run(*arguments, detector="virtual", scatter=windows, efficiency=efficiency[:, ::-1, ::-1])
     np.testing.assert_allclose(upright.background, run.background[:, ::-1, ::-1], rtol=1e-6)
 
 
 def test_the_script_says_the_same_windows_and_smooths(system, frames, tmp_path):
-    given = (frames, system, ORDER["counts.frames"], "back-v", 60.0)
+    arguments = (frames, system, ORDER["counts.frames"], "back-v", 60.0)
     windows = mph.ScatterWindows(ORDER["counts.lower_frames"], None, WIDTHS, 3.0)
-    run = mph.counts_run(*given, scatter=windows)
+    run = mph.counts_run(*arguments, scatter=windows)
     lower, peak, _ = frames.reshape(3, 12, 6, 6)
     np.testing.assert_allclose(run.background, mph.energy_window_scatter(lower, peak, None, WIDTHS, 3.0)[0], rtol=1e-6)
-    upright = mph.counts_run(*given, detector="virtual", scatter=windows)
-    np.testing.assert_allclose(upright.background, run.background[:, ::-1, ::-1], rtol=1e-6)
     np.save(tmp_path / "c.npy", frames)
     changes = {"counts.window_widths": WIDTHS, "counts.scatter_fwhm": 3.0, "counts.upper_frames": None}
     (same,) = mph.run_recipe(recipe_of(tmp_path / "c.npy").updated(changes), system)
     np.testing.assert_array_equal(same.background, run.background)
-    assert not np.any(mph.counts_run(*given).background)
+    assert not np.any(mph.counts_run(*arguments).background)
 
 
 def test_what_files_contradict_is_refused(system, frames, tmp_path):
     pytest.importorskip("pydicom")
     path = tmp_path / "nm.dcm"
-
-    def imported(**changes):
-        return next(mph.run_recipe(recipe_of(path).updated(changes), system))
-
     dicom_files.write_frames(frames, path, 60_000, **windows_said())
-    widths, upper = "counts.window_widths", "counts.upper_frames"
-    refused(lambda: imported(**{widths: (6, 20, 6)}), "nm.dcm", "peak window of 28 keV", "20")
-    refused(lambda: imported(**{upper: ORDER["counts.lower_frames"]}), "upper_frames", "another window")
-    swapped = {upper: ORDER["counts.lower_frames"], "counts.lower_frames": ORDER[upper]}
-    refused(lambda: imported(**swapped), "lower_frames", "157 keV", "140 keV")
-    refused(lambda: imported(**{upper: "1-12"}), "upper_frames", "frames")
-    assert imported(**{widths: WIDTHS}).background.ndim == 3
     np.save(tmp_path / "c.npy", frames)
-    refused(lambda: next(mph.run_recipe(recipe_of(tmp_path / "c.npy"), system)), "c.npy", "--window-widths")
-    refused(lambda: mph.ScatterWindows(), "lower_frames", "upper_frames")
-    refused(lambda: mph.Recipe({"model.kind": "emission", "counts.files": ["a"], widths: WIDTHS}), "window_widths")
+    widths, lower, upper = "counts.window_widths", "counts.lower_frames", "counts.upper_frames"
+
+    def imported(file=path, **changes):
+        return next(mph.run_recipe(recipe_of(file).updated(changes), system))
+
+    for call, words in (
+        (lambda: imported(**{widths: (6, 20, 6)}), ("nm.dcm", "peak window of 28 keV", "20")),
+        (lambda: imported(**{upper: ORDER[lower]}), ("upper_frames", "another window")),
+        (lambda: imported(**{upper: ORDER[lower], lower: ORDER[upper]}), ("lower_frames", "157 keV", "140 keV")),
+        (lambda: imported(**{upper: "1-12"}), ("upper_frames", "frames")),
+        (lambda: imported(tmp_path / "c.npy"), ("c.npy", "--window-widths")),
+        (lambda: mph.ScatterWindows(), ("lower_frames", "upper_frames")),
+        (lambda: mph.Recipe({"model.kind": "emission", "counts.files": ["a"], widths: WIDTHS}), ("window_widths",)),
+        (lambda: imported(**{"counts.scatter_tails": True}), ("scatter_tails", "isotope")),
+        (lambda: imported(tmp_path / "c.npy", **TAILS, **{widths: WIDTHS}), ("energies", "lower window's")),
+    ):
+        refused(call, *words)
+    assert imported(**{widths: WIDTHS}).background.ndim == 3
 
 
 @pytest.mark.parametrize("window", ["both", "lower"])
 def test_tails_of_the_peak_are_no_scatter(rng, window):
     """Counts are a linear continuum, or one that falls to nothing, and a Gaussian peak: the continuum is found exactly."""
-    erf = math.erf
-    sigma, shape = 0.1 * 140.5 / np.sqrt(8 * np.log(2)), (3, 4, 5)
-    edges = EDGES if window == "both" else (*EDGES[:2], None)
+    sigma, shape, n = 0.1 * 140.5 / np.sqrt(8 * np.log(2)), (3, 4, 5), 3 if window == "both" else 2
+    missing = [None] * (3 - n)
+    edges, widths = [*EDGES[:n], *missing], [*WIDTHS[:n], *missing]
     shares = peak_shares(mph.isotope("Tc-99m"), edges, 0.1)
-    for (low, high), share in zip(EDGES, shares if window == "both" else shares[:2], strict=False):
-        assert share == pytest.approx(
-            (erf((high - 140.5) / sigma / 2**0.5) - erf((low - 140.5) / sigma / 2**0.5)) / 2, rel=1e-9
-        )
-    scatter, photons = continuum(shape, rng, falls_to=None if window == "both" else 157.0), rng.uniform(100, 900, shape)
-    lower, peak, upper = (own + share * photons for own, share in zip(scatter, shares, strict=True))
-    means, widths = (
-        (lower, peak, upper if window == "both" else None),
-        WIDTHS if window == "both" else (6.0, 28.0, None),
-    )
-    found, _ = mph.energy_window_scatter(*means, widths, shares=shares)
-    np.testing.assert_allclose(found, scatter[1], rtol=1e-12)
-    draws = [None if mean is None else rng.poisson(mean[:1], (1000, 4, 5)) for mean in means]
-    found, variance = mph.energy_window_scatter(*draws, widths, shares=shares)
-    assert variance.mean() == pytest.approx(np.var(found, axis=0, ddof=1).mean(), rel=0.05)
+    for (low, high), share in zip(EDGES[:n], shares, strict=False):
+        below_high, below_low = (math.erf((energy - 140.5) / sigma / 2**0.5) for energy in (high, low))
+        assert share == pytest.approx((below_high - below_low) / 2, rel=1e-9)
+    scatter, photons = continuum(shape, rng, falls_to=157.0 if missing else None), rng.uniform(100, 900, shape)
+    means = [part + share * photons for part, share in zip(scatter[:n], shares, strict=False)]
+    estimate, _ = mph.energy_window_scatter(*means, *missing, widths, shares=shares)
+    np.testing.assert_allclose(estimate, scatter[1], rtol=1e-12)
+    draws = [rng.poisson(mean[:1], (1000, 4, 5)) for mean in means]
+    estimates, variance = mph.energy_window_scatter(*draws, *missing, widths, shares=shares)
+    assert variance.mean() == pytest.approx(np.var(estimates, axis=0, ddof=1).mean(), rel=0.05)
+
+
+TAILS = {"model.isotope": "Tc-99m", "model.energy_fwhm": 0.1, "counts.scatter_tails": True}
 
 
 def test_a_recipe_takes_tails_off(system, frames, tmp_path):
     pytest.importorskip("pydicom")
     dicom_files.write_frames(frames, path := tmp_path / "nm.dcm", 60_000, **windows_said())
-    given = {"model.isotope": "Tc-99m", "model.energy_fwhm": 0.1, "counts.scatter_tails": True}
-    (run,) = mph.run_recipe(recipe_of(path, **given), system)
+    (run,) = mph.run_recipe(recipe_of(path, **TAILS), system)
     shares = peak_shares(mph.isotope("Tc-99m"), EDGES, 0.1)
     np.testing.assert_allclose(run.background, scatter_of(frames, shares=shares).clip(min=0), rtol=1e-5, atol=1e-5)
-    refused(
-        lambda: mph.run_recipe(recipe_of(path, **{"counts.scatter_tails": True}), system),
-        "scatter_tails",
-        "isotope",
-    )
-    np.save(tmp_path / "c.npy", frames)
-    unsaid = recipe_of(tmp_path / "c.npy", **given, **{"counts.window_widths": WIDTHS})
-    refused(lambda: list(mph.run_recipe(unsaid, system)), "energies", "lower window's")

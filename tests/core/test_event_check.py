@@ -8,10 +8,9 @@ from pathlib import Path
 
 import pytest
 
-import mphdrr.core as mph
-from mphdrr.addon.cli import main
 from mphdrr.core import events
 
+from .conftest import refused
 from .small_events import TEXT, WORKBOOK, small_recipe
 from .test_event_work import tree
 
@@ -25,6 +24,12 @@ def made(tmp_path_factory) -> Path:
     other = small_recipe(folder / "other", TEXT.replace("seed = 5", "seed = 6"))
     events.make(other, folder / "foreign", 3)
     return folder
+
+
+@pytest.fixture
+def folder(made, tmp_path) -> Path:
+    """A copy of the set, to damage."""
+    return Path(shutil.copytree(made / "set", tmp_path / "set"))
 
 
 def cut(folder: Path, others: Path) -> Path:
@@ -117,64 +122,49 @@ DAMAGE = {
 
 
 @pytest.mark.parametrize("damage", DAMAGE, ids=lambda damage: damage.__name__)
-def test_damage_is_found_and_mended_and_nothing_else_is_touched(tmp_path, made, damage, capsys):
-    folder = tmp_path / "set"
-    shutil.copytree(made / "set", folder)
+def test_damage_is_found_and_mended_and_nothing_else_is_touched(tmp_path, made, folder, damage, command):
     before = tree(folder)
-    assert main(["events", "check", str(folder)]) == 0
-    assert "5 events, every byte as it was written" in capsys.readouterr().out
+    assert "5 events, every byte as it was written" in command("events", "check", folder).out
     path = damage(folder, made)
     times = {file: file.stat().st_mtime_ns for file in folder.rglob("*") if file.is_file() and file != path}
-    assert main(["events", "check", str(folder)]) == 1
-    said = capsys.readouterr()
+    said = command("events", "check", folder, status=1)
     (line,) = said.out.splitlines()
     assert line.startswith(str(path)) and DAMAGE[damage] in line
     assert "1 fault; --repair mends" in said.err
-    assert main(["events", "check", str(folder), "--repair"]) == 0
+    command("events", "check", folder, "--repair")
     assert tree(folder) == before
     assert {file: file.stat().st_mtime_ns for file in times} == times
     moved = [file.name for file in (tmp_path / "set-foreign").glob("*")]
     assert moved == ([path.name] if damage in (foreign, foreign_event, folder_for_event) else [])
-    assert main(["events", "check", str(folder)]) == 0
+    command("events", "check", folder)
 
 
-def test_all_damage_at_once(tmp_path, made, capsys):
-    folder = tmp_path / "set"
-    shutil.copytree(made / "set", folder)
+def test_all_damage_at_once(made, folder, command):
     before = tree(folder)
     paths = {str(damage(folder, made)) for damage in (cut, other_recipe, changed_byte, missing, foreign)}
     assert {str(fault.path) for fault in events.check(folder)} == paths
-    assert main(["events", "check", str(folder), "--json"]) == 1
-    assert {fault["path"] for fault in json.loads(capsys.readouterr().out)} == paths
-    assert main(["events", "check", str(folder), "--repair", "--workers", "2"]) == 0
-    assert "4 events made anew" in capsys.readouterr().out
+    assert {fault["path"] for fault in json.loads(command("events", "check", folder, "--json", status=1).out)} == paths
+    assert "4 events made anew" in command("events", "check", folder, "--repair", "--workers", "2").out
     assert tree(folder) == before
 
 
-def test_a_changed_input_is_found_and_not_mended(tmp_path, made, capsys):
-    folder = tmp_path / "set"
-    shutil.copytree(made / "set", folder)
+def test_a_changed_input_is_found_and_not_mended(folder, command):
     path = folder / "inputs" / WORKBOOK.name
     path.write_bytes(path.read_bytes() + b" ")
-    assert main(["events", "check", str(folder), "--repair"]) == 1
-    assert "put the original back" in capsys.readouterr().err
+    assert "put the original back" in command("events", "check", folder, "--repair", status=1).err
 
 
-def test_a_changed_recipe_is_found_and_its_events_made_anew(tmp_path, made, capsys):
-    folder = tmp_path / "set"
-    shutil.copytree(made / "set", folder)
+def test_a_changed_recipe_is_found_and_its_events_made_anew(made, folder, command):
     (folder / "recipe.toml").write_text(TEXT.replace("seed = 5", "seed = 6"))
-    assert main(["events", "make", str(folder), "-n", "5"]) == 1
-    assert "an event of another recipe" in capsys.readouterr().err
-    assert main(["events", "check", str(folder)]) == 1
-    assert capsys.readouterr().out.count("of another recipe") == 5
-    assert main(["events", "check", str(folder), "--repair"]) == 0
+    assert "an event of another recipe" in command("events", "make", folder, "-n", "5", status=1).err
+    assert command("events", "check", folder, status=1).out.count("of another recipe") == 5
+    command("events", "check", folder, "--repair")
     for number in range(3):
         name = f"events/{number:06d}.h5"
         assert (folder / name).read_bytes() == (made / "foreign" / name).read_bytes()
 
 
-def test_what_the_recipe_names_may_lie_in_the_folder(tmp_path):
+def test_what_the_recipe_names_may_lie_in_the_folder(tmp_path, command):
     """A recipe that was written there, with its workbook beside it and in the folder of copies."""
     folder = tmp_path / "set"
     (folder / "inputs").mkdir(parents=True)
@@ -185,22 +175,16 @@ def test_what_the_recipe_names_may_lie_in_the_folder(tmp_path):
     events.make(events.read_recipe(folder / "recipe.toml"), folder, 1)
     assert (folder / "inputs" / "mine.txt").exists() and recipe.seed == 5
     assert [fault.path.name for fault in events.check(folder)] == ["mine.txt"]
-    assert main(["events", "make", str(folder), "-n", "2"]) == 0
+    command("events", "make", folder, "-n", "2")
 
 
-def test_status(tmp_path, made, capsys):
-    folder = tmp_path / "set"
-    shutil.copytree(made / "set", folder)
+def test_status(tmp_path, made, folder, command):
     missing(folder, made)
     cut(folder, made)
-    assert main(["events", "status", str(folder)]) == 0
-    said = capsys.readouterr().out
+    said = command("events", "status", folder).out
     assert "3 of 5 events" in said and "missing: 1, 4; mphdrr events make" in said
-    assert main(["events", "status", str(folder), "--json"]) == 0
-    found = json.loads(capsys.readouterr().out)
+    found = json.loads(command("events", "status", folder, "--json").out)
     assert found["missing"] == [1, 4] and sum(found["phantoms"].values()) == sum(found["splits"].values()) == 3
-    assert main(["events", "status", str(made)]) == 1
-    assert "no event set" in capsys.readouterr().err
+    assert "no event set" in command("events", "status", made, status=1).err
     assert events.status(folder) == events.Status(**found)
-    with pytest.raises(mph.InputError, match="no event set"):
-        events.check(tmp_path)
+    refused(lambda: events.check(tmp_path), "no event set")

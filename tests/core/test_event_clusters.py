@@ -120,19 +120,8 @@ def test_a_lost_disk_ends_in_one_line_and_the_set_resumes(tmp_path, wanted, work
     pytest.importorskip("ziglang")
     (tmp_path / "lost.c").write_text(LOST)
     library, marker = tmp_path / "lost.so", tmp_path / "now"
-    command = [
-        sys.executable,
-        "-m",
-        "ziglang",
-        "cc",
-        "-shared",
-        "-fPIC",
-        "-O1",
-        "-o",
-        str(library),
-        str(tmp_path / "lost.c"),
-    ]
-    subprocess.run(command, check=True)
+    compiler = [sys.executable, "-m", "ziglang", "cc", "-shared", "-fPIC", "-O1"]
+    subprocess.run([*compiler, "-o", str(library), str(tmp_path / "lost.c")], check=True)
 
     shim = {"LD_PRELOAD": str(library), "LOST_FOLDER": str(tmp_path / "set"), "LOST_WHEN": str(marker)}
     work = make(tmp_path, "--workers", workers, env=os.environ | shim)
@@ -140,9 +129,7 @@ def test_a_lost_disk_ends_in_one_line_and_the_set_resumes(tmp_path, wanted, work
     marker.touch()
     _, said = work.communicate(timeout=600)
     assert work.returncode == 1
-    assert len(said.splitlines()) == 1, said
-    line = said
-    assert line.startswith("mphdrr: ") and "Input/output error" in line
+    assert len(said.splitlines()) == 1 and said.startswith("mphdrr: ") and "Input/output error" in said, said
     marker.unlink()
     assert make(tmp_path, "--workers", workers).wait(600) == 0
     assert tree(tmp_path / "set") == wanted

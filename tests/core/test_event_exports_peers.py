@@ -63,27 +63,6 @@ def test_pytorch_3dunet_loads_raw_and_label(unet3d, dataset, raw, event_set, tmp
     assert not labels
 
 
-def test_pytorch_3dunet_trains_a_step_on_them(unet3d, event_set, tmp_path):
-    from pytorch3dunet.unet3d.model import UNet3D
-
-    export_events(event_set, tmp_path, "3dunet", models="counts")
-    loaders = {"num_workers": 0, "batch_size": 2}
-    loaders |= {"train": phase(tmp_path / "train", (16, 12, 12)), "val": phase(tmp_path / "test", (16, 12, 12))}
-    made = unet3d.get_train_loaders({"loaders": loaders, "device": "cpu"})
-    torch.manual_seed(1)
-    network = UNet3D(1, 1, final_sigmoid=False, f_maps=4, num_levels=2, num_groups=2, is_segmentation=False)
-    image, label = next(iter(made["train"]))
-    losses = []
-    optimizer = torch.optim.Adam(network.parameters(), 0.05)
-    for _ in range(6):
-        loss = torch.nn.functional.mse_loss(network(image / image.max()), label / label.max())
-        losses.append(loss.item())
-        optimizer.zero_grad()
-        loss.backward()
-        optimizer.step()
-    assert losses[-1] < losses[0]
-
-
 def test_pytorch_3dunet_trains_by_our_configuration_and_keeps_the_activity(unet3d, event_set, tmp_path):
     """With its own trainer: `examples/learning/pytorch-3dunet.yml` but for sizes and folders."""
     import yaml

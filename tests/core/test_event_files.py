@@ -11,6 +11,7 @@ from mphdrr.core.events import event_files
 from mphdrr.core.events.event_files import FileLocation
 from mphdrr.core.hdf5 import HEADER
 
+from .conftest import refused
 from .small_events import TEXT, WORKBOOK, small_recipe
 
 h5py = pytest.importorskip("h5py")
@@ -115,17 +116,14 @@ def test_every_changed_byte_is_noticed(small, tmp_path):
                 raise mph.InputError("of another event or recipe")
     for changed in (original[:-1], original + b"\0", original[:100], b""):
         path.write_bytes(changed)
-        with pytest.raises(mph.InputError):
-            event_files.verify(FileLocation(str(path)))
+        refused(lambda: event_files.verify(FileLocation(str(path))))
 
 
 def test_bytes_do_not_depend_on_threads_or_on_what_was_made_before(small):
     recipe = small.recipe
     system = small.system
-    geometry = {
-        "projection_matrix": (small[0].views.projection_matrices(), "pixel"),
-        "number": (system.numbers, "1"),
-    }
+    matrices = small[0].views.projection_matrices()
+    geometry = {"projection_matrix": (matrices, "pixel"), "number": (system.numbers, "1")}
     for threads in (1, 3):
         maker = events.EventMaker(recipe, threads)
         for number in (1, 0, 1):

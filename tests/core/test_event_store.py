@@ -24,6 +24,7 @@ from mphdrr.core.events import store as stores
 from mphdrr.core.events.folders import SetFolder
 from mphdrr.core.events.store import Store
 
+from .conftest import refused
 from .small_events import TEXT, small_recipe
 from .test_event_work import tree
 
@@ -111,10 +112,7 @@ def test_a_kill_while_packing_loses_nothing(whole, made, at, monkeypatch):
             raise KeyboardInterrupt
 
     monkeypatch.setattr(stores, "_write_member", killed)
-    monkeypatch.setattr(
-        stores, "_flush", lambda file, end, batch: None if len(written) == 2 else real(file, end, batch)
-    )
-    real = flush
+    monkeypatch.setattr(stores, "_flush", lambda *batch: None if len(written) == 2 else flush(*batch))
     with pytest.raises(KeyboardInterrupt):
         store.pack()
     monkeypatch.undo()
@@ -191,8 +189,7 @@ def test_a_set_of_an_earlier_version_opens_and_goes_on(whole, made):
     data = bytearray((whole / "shards" / "000000.tar").read_bytes())
     data[3000] ^= 1
     (whole / "shards" / "000000.tar").write_bytes(data)
-    with pytest.raises(mph.InputError, match="changed"):
-        _ = events.EventSet(whole)[0].pose
+    refused(lambda: events.EventSet(whole)[0].pose, "changed")
 
 
 def test_two_works_pack_one_after_the_other(whole):
@@ -210,7 +207,7 @@ def test_readers_go_on_while_a_set_is_packed(whole, made):
     there = events.EventSet(whole)
     packed(whole)
     for event, other in zip(there, events.EventSet(made), strict=True):
-        assert np.array_equal(event.images("lines"), other.images("lines"))
+        assert_same_event(event, other)
 
 
 def test_writers_of_the_same_events_overlap_without_harm(tmp_path, made, monkeypatch):
@@ -373,8 +370,7 @@ def test_an_event_that_is_not_as_it_should_be_is_refused_by_name(whole, change, 
     path = whole / "events" / "000002.h5"
     change(path, edit)
     event = events.EventSet(whole)[2]
-    with pytest.raises(mph.InputError, match=f"000002.h5: .*{said}"):
-        _ = event.pose, event.images("lines")
+    refused(lambda: (event.pose, event.images("lines")), f"000002.h5: .*{said}")
 
 
 @pytest.mark.parametrize("count", [60, pytest.param(200, marks=pytest.mark.long)])
@@ -397,10 +393,9 @@ def test_a_loader_skips_damaged_events_where_asked(whole):
     path.write_bytes(path.read_bytes()[:-100])
     (whole / "events" / "000003.h5").unlink()
     there = events.EventSet(whole)
-    with pytest.raises(mph.InputError, match=r"000001\.h5: cut"):
-        list(torch.utils.data.DataLoader(events.torch_dataset(there, "lines"), batch_size=2))
-    with pytest.raises(mph.InputError, match=r"000001\.h5: cut"):
-        list(torch.utils.data.DataLoader(events.torch_dataset(there, "lines"), num_workers=1))
+    for options in ({"batch_size": 2}, {"num_workers": 1}):
+        with pytest.raises(mph.InputError, match=r"000001\.h5: cut"):
+            list(torch.utils.data.DataLoader(events.torch_dataset(there, "lines"), **options))
     chosen = events.torch_dataset(there, ("lines", "truth"), skip_damaged=True)
     with pytest.warns(mph.InputWarning, match=r"000001\.h5: cut.*left out"):
         batches = list(torch.utils.data.DataLoader(chosen, batch_size=2))

@@ -10,8 +10,8 @@ import pytest
 
 import mphdrr.core as mph
 from mphdrr.core.events import EventMaker, EventRecipe
+from mphdrr.core.recipes.toml import toml_value
 from mphdrr.core.recording import recorded_warnings
-from mphdrr.core.toml import toml_value
 
 from .small_events import WORKBOOK
 
@@ -88,11 +88,8 @@ def event_text(given: dict[str, Any]) -> str:
         name: {} for name in ("system", "detector", "truth", "phantoms", "pose", "model")
     }
     is_mu = "model.photons" in given
-    tables["truth"] = {
-        "voxels": VOXELS,
-        "spacing": given["phantom.spacing"][0],
-        "quantity": "mu" if is_mu else "activity",
-    }
+    tables["truth"] = {"voxels": VOXELS, "spacing": given["phantom.spacing"][0]}
+    tables["truth"]["quantity"] = "mu" if is_mu else "activity"
     places = {
         "volume.file": "phantoms.file", "volume.energy": "phantoms.energy", "phantom.position": "pose.position",
         "attenuation.file": "model.attenuation", "attenuation.energy": "model.attenuation_energy",
@@ -110,10 +107,8 @@ def event_text(given: dict[str, Any]) -> str:
     headings = {"phantoms": "[[phantoms]]", "pose": "[phantoms.pose]", "model": "[models.images]"}
     lines = ["version = 1"]
     for table, entries in tables.items():
-        lines += [
-            headings.get(table, f"[{table}]"),
-            *(f"{key} = {toml_value(value)}" for key, value in entries.items()),
-        ]
+        lines.append(headings.get(table, f"[{table}]"))
+        lines += [f"{key} = {toml_value(value)}" for key, value in entries.items()]
     return "\n".join([*lines, 'kind = "transmission"'] if "kind" not in tables["model"] else lines)
 
 

@@ -42,17 +42,8 @@ def undisturbed(tmp_path_factory) -> dict[str, bytes]:
 
 def begin(folder: Path, *options: str, **how: Any) -> subprocess.Popen[str]:
     """The command, begun."""
-    command = [
-        sys.executable,
-        "-m",
-        "mphdrr",
-        "events",
-        "make",
-        str(folder / "set"),
-        "--recipe",
-        str(folder / "small.toml"),
-    ]
-    command += ["-n", str(COUNT), *options]
+    command = [sys.executable, "-m", "mphdrr", "events", "make", str(folder / "set")]
+    command += ["--recipe", str(folder / "small.toml"), "-n", str(COUNT), *options]
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=folder, **how)
 
 
@@ -239,17 +230,15 @@ def test_workers_that_die_again_and_again_are_refused(tmp_path, monkeypatch):
         events.make(recipe, tmp_path / "set", 3, workers=2)
 
 
-def test_what_a_worker_refuses_is_one_line(tmp_path, capsys):
+def test_what_a_worker_refuses_is_one_line(tmp_path, command):
     text = TEXT.replace("pixel_points = 1", 'pixel_points = 1\nattenuation = "phantom"').replace(
         'kind = "points"', 'kind = "points"\nspheres = 3'
     )
     folder = tmp_path
     (folder / "small.toml").write_text(text)
-    status = main(
-        ["events", "make", str(folder / "set"), "--recipe", str(folder / "small.toml"), "-n", "3", "--workers", "2"]
-    )
-    said = capsys.readouterr().err
-    assert status == 1 and "points: spheres: no such setting; expected counts" in said and "Traceback" not in said
+    options = ["--recipe", folder / "small.toml", "-n", "3", "--workers", "2"]
+    said = command("events", "make", folder / "set", *options, status=1).err
+    assert "points: spheres: no such setting; expected counts" in said and "Traceback" not in said
 
 
 @pytest.fixture

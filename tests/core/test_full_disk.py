@@ -1,17 +1,12 @@
 """A disk that is full: one line, nothing left, and the old file as it was, whatever is written."""
 
-from __future__ import annotations
-
 import contextlib
-import functools
 import gc
-import importlib.util
 import os
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -20,18 +15,14 @@ import mphdrr.core as mph
 from mphdrr.core.cli import main
 from mphdrr.core.figures.page import Page
 from mphdrr.core.runs.mosaic import write_png
-from mphdrr.core.volumes.meshes.mesh import Mesh, write_mesh
-from mphdrr.core.workbook.column_map import ColumnMap
 
-from .conftest import refused
+from .conftest import needs_torch, refused
 
 # What openpyxl leaves open complains when it is collected.
 pytestmark = pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 
 SIZE = 64 << 10
 """Of the disk; every file below is larger."""
-
-_needs_torch = pytest.mark.skipif(importlib.util.find_spec("torch") is None, reason="torch is not installed")
 
 
 @pytest.fixture(autouse=True)
@@ -42,85 +33,48 @@ def collected() -> Iterator[None]:
     gc.freeze()  # what is left is not looked at again
 
 
-@functools.cache
-def many_modules(count: int = 300) -> mph.PinholeSystem:
-    """So many that what describes them is larger than the disk."""
+def modules(count: int = 300) -> mph.PinholeSystem:
+    """Return a scanner of many modules: what describes them is larger than the disk."""
     angles = np.linspace(0, 6.2, count)
     centers = np.stack([200 * np.cos(angles), 200 * np.sin(angles), np.linspace(-50, 50, count)], axis=1)
     return mph.PinholeSystem(centers, 2.0, 60.0, detector_side=40, detector_thickness=8, roi_radius=50)
 
 
-@functools.cache
-def a_volume() -> mph.Volume:
-    array = np.random.default_rng(3).random((32, 32, 32), np.float32)
-    return mph.Volume(array, mph.Grid(array.shape, np.eye(4)), "activity")
-
-
-@functools.cache
-def a_run() -> mph.ProjectionRun:
-    system = many_modules()
-    views = system.views(shape=(4, 6), detector="real", pitch=(7, 7))
-    return mph.ProjectionRun(np.ones((len(system), 4, 6), np.float32), system, views, a_volume())
-
-
-@functools.cache
-def a_page() -> Page:
-    page = Page(400, 300)
-    page.image(np.random.default_rng(3).integers(0, 255, (150, 150, 3), np.uint8), 0, 0, 400, 300)
-    return page
-
-
-@functools.cache
-def a_mesh() -> Mesh:
-    points = np.random.default_rng(3).random((9000, 3))
-    return Mesh(points, np.arange(9000).reshape(-1, 3))
-
-
-@functools.cache
-def a_reconstruction() -> Any:
-    from mphdrr.core.reconstruction.result import Reconstruction
-
-    return Reconstruction(a_volume(), np.ones(3), {"method": "mlem"}, {"previous": a_volume().array})
-
-
-@functools.cache
-def a_phantom() -> Any:
-    from mphdrr.core.phantoms.phantom import ShapePhantom
-    from mphdrr.core.phantoms.shapes import Sphere
-
-    return ShapePhantom(tuple(Sphere(radius=k + 1.0, activity=1.0) for k in range(2000)))
+MODULES, RNG = modules(), np.random.default_rng(3)
+VOLUME = mph.Volume(RNG.random((32, 32, 32), np.float32), mph.Grid((32, 32, 32), np.eye(4)), "activity")
+IMAGES, VIEWS = np.ones((len(MODULES), 4, 6), np.float32), MODULES.views((4, 6), "real", pitch=(7, 7))
+RUN = mph.ProjectionRun(IMAGES, MODULES, VIEWS, VOLUME)
+RECONSTRUCTION = mph.Reconstruction(VOLUME, np.ones(3), {"method": "mlem"}, {"previous": VOLUME.array})
+MESH = mph.Mesh(RNG.random((9000, 3)), np.arange(9000).reshape(-1, 3))
+PHANTOM = mph.ShapePhantom(tuple(mph.Sphere(radius=k + 1.0, activity=1.0) for k in range(2000)))
+PAGE = Page(400, 300)
+PAGE.image(RNG.integers(0, 255, (150, 150, 3), np.uint8), 0, 0, 400, 300)
 
 
 WRITERS: dict[str, Callable[[Path], object]] = {
-    **{f"run{ending}": lambda path: mph.write_run(a_run(), path) for ending in (".h5", ".npz")},
+    **{f"run{ending}": lambda path: mph.write_run(RUN, path) for ending in (".h5", ".npz", ".pt")},
     **{
-        f"volume{ending}": lambda path: mph.write_volume(a_volume(), path)
+        f"volume{ending}": lambda path: mph.write_volume(VOLUME, path)
         for ending in (".h5", ".npz", ".nrrd", ".nii", ".nii.gz")
     },
-    "reconstruction.h5": lambda path: mph.write_reconstruction(a_reconstruction(), path),
+    "reconstruction.h5": lambda path: mph.write_reconstruction(RECONSTRUCTION, path),
     **{
-        f"geometry{ending}": lambda path, name=name: mph.write_geometry(many_modules(), path, name)
-        for name, ending in (
-            ("mphdrr", ".json"), ("opencv", ".json"), ("rtk", ".xml"), ("nerf", ".transforms.json"))
+        name: lambda path, format=format, count=count: mph.write_geometry(modules(count), path, format)
+        for name, format, count in (
+            ("geometry.json", "mphdrr", 300), ("cameras.json", "opencv", 300), ("geometry.xml", "rtk", 300),
+            ("geometry.transforms.json", "nerf", 300), ("solids.stl", "stl", 120), ("solids.3mf", "3mf", 120),
+            ("solids.glb", "glb", 120), ("cameras.npz", "opencv", 1000), ("parts", "stl-parts", 300),
+            ("gate9", "gate9", 300), ("gate10", "gate10", 300))
     },
-    **{
-        f"solids.{name}": lambda path, name=name: mph.write_geometry(many_modules(120), path, name)
-        for name in ("stl", "3mf", "glb")
-    },
-    "cameras.npz": lambda path: mph.write_geometry(many_modules(1000), path, "opencv"),
-    "parts": lambda path: mph.write_geometry(many_modules(), path, "stl-parts"),
-    "gate9": lambda path: mph.write_geometry(many_modules(), path, "gate9"),
-    "gate10": lambda path: mph.write_geometry(many_modules(), path, "gate10"),
-    **{f"mesh{ending}": lambda path: write_mesh(a_mesh(), path) for ending in (".stl", ".obj", ".ply", ".glb")},
-    **{f"page{ending}": lambda path: a_page().write(path) for ending in (".png", ".svg")},
+    **{f"mesh{ending}": lambda path: mph.write_mesh(MESH, path) for ending in (".stl", ".obj", ".ply", ".glb")},
+    **{f"page{ending}": lambda path: PAGE.write(path) for ending in (".png", ".svg")},
     "mosaic.png": lambda path: write_png(np.random.default_rng(3).random((300, 300)), path),
-    "columns.toml": lambda path: ColumnMap(()).write(path, "word\n" * SIZE),
-    "phantom.toml": lambda path: mph.write_phantom(a_phantom(), path),
-    "scanner.xlsx": lambda path: mph.write_system(many_modules(), path),
+    "columns.toml": lambda path: mph.ColumnMap(()).write(path, "word\n" * SIZE),
+    "phantom.toml": lambda path: mph.write_phantom(PHANTOM, path),
+    "scanner.xlsx": lambda path: mph.write_system(MODULES, path),
 }  # fmt: skip
-"""By the name of the file or, without an ending, the folder."""
-NAMES = [*WRITERS, pytest.param("run.pt", marks=_needs_torch)]
-WRITERS["run.pt"] = lambda path: mph.write_run(a_run(), path)
+"""The writers, by the name of the file or, without an ending, the folder."""
+NAMES = [pytest.param(name, marks=needs_torch) if name == "run.pt" else name for name in WRITERS]
 
 
 def refused_and_nothing_left(write: Callable[[Path], object], path: Path) -> None:
@@ -170,7 +124,6 @@ def test_a_write_that_fails_at_any_byte_is_one_line(tmp_path, name, most):
         if name in ("parts", "gate10", "gate9") and most > 1000:
             pytest.skip("each of its files is smaller")
         write = WRITERS[name]
-        a_run(), a_mesh()  # whatever they import writes byte code
         resource.setrlimit(resource.RLIMIT_FSIZE, (most, before[1]))
         path = tmp_path / name
         refused(lambda: write(path), str(path), "cannot be written")
@@ -201,7 +154,7 @@ def test_a_device_is_not_replaced(tmp_path):
         pytest.skip(f"no links here ({error})")
     if not Path("/dev/full").exists():
         pytest.skip("no devices here")
-    refused(lambda: mph.write_run(a_run(), device), str(device), "is no file")
+    refused(lambda: mph.write_run(RUN, device), str(device), "is no file")
     assert Path("/dev/full").is_char_device()
 
 
@@ -212,7 +165,7 @@ def test_the_file_of_a_killed_process_of_the_same_number_does_not_stop_the_next(
     code += f"with replacing({str(tmp_path / 'a')!r}) as temporary:\n temporary.touch()\n os._exit(0)"
     subprocess.run([sys.executable, "-c", code], check=True)
     assert len(list(tmp_path.iterdir())) == 1
-    mph.write_volume(a_volume(), tmp_path / "a.h5")
+    mph.write_volume(VOLUME, tmp_path / "a.h5")
 
 
 COMMANDS = {
@@ -225,8 +178,8 @@ COMMANDS = {
 
 @pytest.mark.parametrize("command", COMMANDS)
 def test_a_command_on_a_full_disk_is_one_line_and_status_1(disk, tmp_path, workbook, capsys, command):
-    mph.write_volume(a_volume(), tmp_path / "volume.h5")
-    mph.write_run(a_run(), tmp_path / "run.h5")
+    mph.write_volume(VOLUME, tmp_path / "volume.h5")
+    mph.write_run(RUN, tmp_path / "run.h5")
     places = {"workbook": workbook, "volume": tmp_path / "volume.h5", "run": tmp_path / "run.h5", "out": disk / "out"}
     status = main([word.format_map(places) for word in COMMANDS[command]])
     lines = [line for line in capsys.readouterr().err.splitlines() if "warning" not in line and "[#" not in line]

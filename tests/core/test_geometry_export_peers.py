@@ -1,16 +1,12 @@
 """The exported files in the programs themselves: `make test-peers` runs these tests with all of them installed."""
 
-from __future__ import annotations
-
-import re
-
 import numpy as np
 import pytest
 
 import mphdrr.core as mph
 from mphdrr.core.geometry.collimator import Construction
 
-from .test_geometry_export import arrays, fiducials, general_views, project
+from .test_geometry_export import arrays, detector_of, fiducials, general_views, project
 
 
 @pytest.fixture(params=["scanner", "real detector", "any pose", "mirrored"])
@@ -52,7 +48,7 @@ def test_rtk_reads_the_geometry(views, system, rng, tmp_path):
     itk, rtk = imported_rtk()
     mph.write_geometry(system, tmp_path / "a.xml", "rtk", views=views)
     points = fiducials(views, rng)
-    spacing, origin = detector_of(tmp_path / "a.xml")
+    spacing, origin = detector_of((tmp_path / "a.xml").read_text())
     geometry = rtk.read_geometry(str(tmp_path / "a.xml"))
     for m, expected in enumerate(project(views, points)):
         matrix = itk.array_from_matrix(geometry.GetMatrix(m))
@@ -61,19 +57,11 @@ def test_rtk_reads_the_geometry(views, system, rng, tmp_path):
         assert np.allclose(list(geometry.GetSourcePosition(m))[:3], views.sources[m])
 
 
-def detector_of(path):
-    """Spacing and origin of the projections, from the file's comment."""
-    return (
-        np.array(re.search(rf"{word} (\S+) (\S+) [01]\b", path.read_text()).groups(), float)
-        for word in ("spacing", "origin")
-    )
-
-
 def rtk_images(system, views, grid, array, path):
     """Images by RTK's Joseph projector, of the geometry that is written to `path`."""
     itk, rtk = imported_rtk()
     mph.write_geometry(system, path, "rtk", views=views)
-    spacing, origin = detector_of(path)
+    spacing, origin = detector_of(path.read_text())
     volume = itk.image_from_array(np.ascontiguousarray(array.astype(np.float32).T))
     volume.SetSpacing(grid.spacing)
     volume.SetOrigin(grid.affine[:3, 3])

@@ -10,11 +10,12 @@ import pytest
 
 import mphdrr.core as mph
 
-from .conftest import BACKENDS, WORKBOOK, general_grid, refused
+from .conftest import WORKBOOK, general_grid, refused, voxel_centers
 from .test_batch_axes import check_batch
-from .test_emission import assert_adjoint, assert_real_is_virtual, sensitivity
+from .test_emission import assert_adjoint, assert_real_is_virtual, one_module, sensitivity
 from .test_projector import rotation
 from .test_volume_formats import CHEST
+from .traced_photons import misplaced
 
 SYSTEM = mph.read_system(WORKBOOK)[[0, 47]]
 
@@ -130,38 +131,52 @@ def test_many_voxels_have_the_whole_holes_image(near, work, rng):
     assert_right([error for _ in range(5) for error in errors_of_voxels(rng, *any_sizes(), near, 2, 400, work)])
 
 
-def test_blurred_by_the_crystal_it_is_within_one_per_cent(rng):
-    grid = mph.Grid.centered((20, 20, 20), 4.0)
-    x = rng.random(grid.shape) ** 8
-    hole = {"intrinsic_fwhm": 1.0, "crystal_mu": "NaI", "isotope": "Tc-99m", "aperture_mu": "tungsten"}
-    blurred = depth_projector(grid, 32, **hole)
-    rays = mph.Emission(SYSTEM, aperture_points=61, pixel_points=13, tolerance=0.1, **hole)
-    exact = mph.Projector(grid, blurred.views, rays)(x)
-    assert np.abs(blurred(x) - exact).sum() < 0.01 * exact.sum()
-
-
 def test_no_voxel_is_missed():
     """Counts of single small voxels by the law of a point source, wherever they are between the pixels."""
     grid = mph.Grid.centered((40, 40, 40), 0.3)
-    system = mph.PinholeSystem(
-        centers=[[200.0, 0.0, 0.0]], roi_radius=60.0, pinhole_diameter=2.0, collimator_length=60.0, detector_side=50.0,
-        detector_thickness=10.0,
-    )  # fmt: skip
+    system = one_module()
     A = depth_projector(grid, 16, system=system)
-    middles = grid.affine[:3, :3] @ np.indices(grid.shape).reshape(3, -1) + grid.affine[:3, 3:]
-    law = sensitivity(system, middles.T)[0].reshape(grid.shape) * 0.3**3
+    law = sensitivity(system, voxel_centers(grid).reshape(-1, 3))[0].reshape(grid.shape) * 0.3**3
     np.testing.assert_allclose(A.T(np.ones(A.shape_out)), law, rtol=2e-3)
 
 
-@pytest.mark.parametrize("backend", [b for b in BACKENDS if b in ("cpu", "numpy")])
-def test_adjoint_is_exact_and_backends_agree(backend, rng):
-    grid = general_grid(rng, (9, 8, 21))
-    A = depth_projector(grid, 12, backend, intrinsic_fwhm=2.0, within_crystal=True)
-    assert_adjoint(A, rng)
-    x, y = rng.random(A.shape_in), rng.random(A.shape_out)
-    reference = depth_projector(grid, 12, "numpy", intrinsic_fwhm=2.0, within_crystal=True)
-    for found, expected in ((A(x), reference(x)), (A.T(y), reference.T(y))):
-        np.testing.assert_allclose(found, expected, rtol=2e-5, atol=1e-5 * expected.max())
+EDGE = {"edge": "path", "aperture_mu": 2.0}
+DEEP = {"crystal_mu": 0.26, "depth_layers": 8}
+WITHIN = {"intrinsic_fwhm": 2.0, "within_crystal": True}
+
+
+@pytest.mark.parametrize("backend", ["cpu", "numpy"])
+@pytest.mark.parametrize("settings", [EDGE, {**DEEP, **WITHIN}, {**DEEP, **EDGE, **WITHIN}, WITHIN])
+def test_adjoint_is_exact_and_backends_agree(settings, backend, rng):
+    grid, views, model = (
+        general_grid(rng, (9, 8, 21)),
+        SYSTEM.views((22, 19)),
+        mph.Emission(SYSTEM, hole="depth", **settings),
+    )
+    x, y = rng.random(grid.shape), rng.random((2, 22, 19))
+    reference = mph.Projector(grid, views, model, "numpy", double=True)
+    for double in (False, True)[settings is not WITHIN :]:
+        A = mph.Projector(grid, views, model, backend, double=double)
+        assert_adjoint(A, rng)
+        assert not double or (A(x) * y).sum() == pytest.approx((A.T(y) * x).sum(), rel=1e-12)
+        for numbers, expected in ((A(x), reference(x)), (A.T(y), reference.T(y))):
+            np.testing.assert_allclose(numbers, expected, rtol=0, atol=(1e-12 if double else 1e-5) * expected.max())
+
+
+@pytest.mark.parametrize(("settings", "points", "bound"), [
+    ({"intrinsic_fwhm": 1.0, "crystal_mu": "NaI", "isotope": "Tc-99m", "aperture_mu": "tungsten"}, (61, 13), 0.01),
+    ({"edge": "path", "aperture_mu": 3.6, "plate_thickness": 3.0}, (61, 13), 0.01),
+    ({"edge": "path", "aperture_mu": 3.6, "within_crystal": True, **DEEP}, (37, 8), 0.012),
+])  # fmt: skip
+def test_images_are_those_of_many_rays(settings, points, bound, rng):
+    grid, system = mph.Grid.centered((12, 12, 12), 6.0), SYSTEM[1:]
+    x = rng.random(grid.shape) ** 8
+    A = depth_projector(grid, 24, system=system, **settings)
+    hole_points, pixel_points = points
+    rays = mph.Emission(
+        system, hole="rays", aperture_points=hole_points, pixel_points=pixel_points, tolerance=1e9, **settings
+    )
+    assert misplaced(A(x), mph.Projector(grid, A.views, rays)(x)) < bound
 
 
 def test_threads_change_nothing(rng):
@@ -177,66 +192,36 @@ def test_real_detectors_images_are_inverted(rng):
     assert_real_is_virtual(mph.Emission(SYSTEM, hole="depth"), rng)
 
 
-def test_tensors_have_gradients(rng):
-    torch = pytest.importorskip("torch")
-    A = depth_projector(mph.Grid.centered((6, 6, 6), 6.0), 8)
-    x = torch.rand(A.shape_in, requires_grad=True)
-    y = torch.rand(A.shape_out)
-    (A(x) * y).sum().backward()
-    torch.testing.assert_close(x.grad, A.T(y))
-
-
-@pytest.mark.parametrize(
-    ("changes", "said"),
-    [
-        ({"hole": "cone"}, "hole: expected 'auto', 'depth', 'rays' or 'point'"),
-        ({"hole": "depth", "aperture_points": 7}, "hole 'depth' takes no points"),
-    ],
-)
-def test_what_it_does_not_take_is_refused(changes, said):
-    refused(lambda: mph.Emission(SYSTEM, **changes), said)
-
-
-@pytest.mark.parametrize("backend", [b for b in BACKENDS if b in ("cpu", "numpy")])
+@pytest.mark.parametrize("backend", ["cpu", "numpy"])
 def test_attenuated_it_agrees_with_rays(backend, rng):
     """An active ball, off the middle of a water cylinder on a grid of its own; and the adjoint."""
     n = 20 if backend == "cpu" else 8
     grid = mph.Grid.centered((n, n, n), 60 / n)
     water = mph.Grid.centered((40, 40, 40), 4.0, (1.0, 2.0, 3.0))
-    x, y, _ = np.moveaxis(centres(water), -1, 0)
+    x, y, _ = np.moveaxis(voxel_centers(water), -1, 0)
     mu = mph.Volume((np.hypot(x, y) < 60) * 0.0154, water, "mu")
     A = depth_projector(grid, 24, backend, mu=mu)
     assert_adjoint(A, rng)
     if backend == "cpu":
-        middle = np.linalg.norm(centres(grid) - (10, 5, 0), axis=-1) < 15
+        middle = np.linalg.norm(voxel_centers(grid) - (10, 5, 0), axis=-1) < 15
         rays = mph.Emission(SYSTEM, mu, aperture_points=61, pixel_points=13, tolerance=0.2)
         exact = mph.Projector(grid, A.views, rays)(middle.astype(float))
         assert np.abs(A(middle.astype(float)) - exact).sum() < 0.01 * exact.sum()
 
 
-def centres(grid):
-    """World places (n_x, n_y, n_z, 3) of a grid's voxels."""
-    return np.moveaxis(np.indices(grid.shape), 0, -1) @ grid.affine[:3, :3].T + grid.affine[:3, 3]
-
-
 @pytest.mark.parametrize("wide", [4.0, 80.0, 500.0])
 def test_every_voxel_loses_photons_however_wide_those_of_mu_are(wide):
     """Behind a slab of mu, of voxels as wide as this, exp(-mu d / cos(psi)) are left."""
-    system = mph.PinholeSystem([[200.0, 0.0, 0.0]], 2.0, 60.0, 50.0, 10.0, roi_radius=60.0)
+    system = one_module()
     n = max(1, round(120 / wide))
     slab = mph.Volume(
         np.full((1, n, n), 0.02), mph.Grid.centered((1, n, n), (40.0, wide, wide), (60.0, 0.0, 0.0)), "mu"
     )
     grid = mph.Grid.centered(24, 1.5)
     bare, behind = (depth_projector(grid, 32, system=system, mu=mu).T(np.ones((1, 32, 32))) for mu in (None, slab))
-    x, y, z = np.meshgrid(*[1.5 * (np.arange(24) - 11.5)] * 3, indexing="ij")
+    x, y, z = np.moveaxis(voxel_centers(grid), -1, 0)
     secant = np.sqrt(1 + (y**2 + z**2) / (200 - x) ** 2)
     np.testing.assert_allclose(behind / bare, np.exp(-0.02 * 40 * secant), rtol=1e-3)
-
-
-def test_grids_near_the_pinhole_are_refused():
-    A = depth_projector(mph.Grid.centered((4, 4, 4), 90.0), 8)
-    refused(lambda: A(np.ones(A.shape_in)), "take a smaller grid", "hole 'auto' or 'rays'")
 
 
 def test_so_near_to_a_pinhole_rays_take_over(rng):
@@ -251,13 +236,13 @@ def test_so_near_to_a_pinhole_rays_take_over(rng):
     assert_adjoint(A, rng)
     rays = mph.Projector(grid, views, mph.Emission(SYSTEM, mu, hole="rays", aperture_points=19, pixel_points=9,
                                                    tolerance=1e9, intrinsic_fwhm=1.0))  # fmt: skip
-    x = rng.random(grid.shape) * (np.linalg.norm(centres(grid) - SYSTEM.centers[0], axis=-1) < 60)
+    x = rng.random(grid.shape) * (np.linalg.norm(voxel_centers(grid) - SYSTEM.centers[0], axis=-1) < 60)
     found, expected = A(x)[0], rays(x)[0]
     assert expected.sum() > 0
     assert np.abs(found - expected).sum() < 0.03 * expected.sum()
 
 
-@pytest.mark.parametrize("backend", [b for b in BACKENDS if b in ("cpu", "numpy")])
+@pytest.mark.parametrize("backend", ["cpu", "numpy"])
 def test_attenuation_given_in_the_call_is_that_of_the_model(backend, rng):
     grid, own = general_grid(rng, (9, 8, 7)), general_grid(rng, (5, 4, 6))
     mu, other = (mph.Volume(rng.uniform(0, 0.05, own.shape), own, "mu") for _ in range(2))
@@ -272,22 +257,23 @@ def test_attenuation_given_in_the_call_is_that_of_the_model(backend, rng):
     np.testing.assert_allclose(x.grad, expected.T(y), rtol=1e-6)
 
 
-@pytest.mark.long
-def test_gradients_by_attenuation_are_central_differences(rng):
+@pytest.mark.parametrize(("size", "settings"), [
+    pytest.param(130.0, {}, marks=pytest.mark.long), (8.0, {**DEEP, **EDGE, "hole": "depth"}),
+])  # fmt: skip
+def test_gradients_by_attenuation_and_activity_are_central_differences(size, settings, rng):
     """Also where some voxels are so close to a pinhole that rays project them."""
     torch = pytest.importorskip("torch")
-    grid = mph.Grid.centered((5, 5, 5), 130.0)
+    grid = mph.Grid.centered((5, 5, 5), size)
     views, mu = SYSTEM.views((6, 6)), mph.Volume(np.zeros(grid.shape), grid, "mu")
-    A = mph.Projector(grid, views, mph.Emission(SYSTEM, mu), double=True)
-    assert A._close_parts
-    given, weights = (
-        torch.tensor(rng.uniform(0, 0.001, grid.shape), requires_grad=True),
-        torch.tensor(rng.random(A.shape_out)),
-    )
-    x, along, step = torch.tensor(rng.random(grid.shape)), torch.tensor(rng.random(grid.shape)), 1e-6
-    (A(x, mu=given) * weights).sum().backward()
-    more, less = ((A(x, mu=given.detach() + sign * step * along) * weights).sum() for sign in (1, -1))
-    np.testing.assert_allclose((given.grad * along).sum(), (more - less) / (2 * step), rtol=1e-6)
+    A = mph.Projector(grid, views, mph.Emission(SYSTEM, mu, **settings), double=True)
+    assert bool(A._close_parts) == (size == 130.0)
+    x, values = (torch.tensor(rng.uniform(0, largest, grid.shape), requires_grad=True) for largest in (1, 0.1 / size))
+    weights, along, step = torch.tensor(rng.random(A.shape_out)), torch.tensor(rng.random(grid.shape)), 1e-6
+    (A(x, mu=values) * weights).sum().backward()
+    activity, mu_values = x.detach(), values.detach()
+    ahead, behind = ((A(activity, mu=mu_values + sign * step * along) * weights).sum() for sign in (1, -1))
+    np.testing.assert_allclose((values.grad * along).sum(), (ahead - behind) / (2 * step), rtol=1e-6)
+    np.testing.assert_allclose((x.grad * along).sum(), (A(along, mu=mu_values) * weights).sum(), rtol=1e-9)
 
 
 def test_a_batch_is_each_alone(rng):
@@ -296,17 +282,18 @@ def test_a_batch_is_each_alone(rng):
     check_batch(depth_projector(grid, 10, mu=mu), rng, (2,))
 
 
-def test_a_part_of_a_volume_has_its_part_of_the_images(rng):
+@pytest.mark.parametrize("settings", [{}, EDGE])
+def test_a_part_of_a_volume_has_its_part_of_the_images(settings, rng):
     """What is empty is left out, and changes nothing, whatever was projected before."""
-    grid = general_grid(rng, (30, 28, 26))
-    mu = mph.Volume(rng.uniform(0, 0.02, grid.shape), grid, "mu")
-    x, parts = rng.random(grid.shape), np.zeros((2, *grid.shape))
-    parts[0, 7:19, :, 5:9], parts[1] = x[7:19, :, 5:9], x
-    parts[1, 7:19, :, 5:9] = 0
-    A = depth_projector(grid, 20, mu=mu)
-    small, rest, whole = A(parts[0]), A(parts[1]), A(x)
-    np.testing.assert_allclose(small + rest, whole, rtol=1e-4, atol=2e-6 * whole.max())
-    np.testing.assert_array_equal(depth_projector(grid, 20, mu=mu)(parts[0]), small)
+    grid, views = general_grid(rng, (20, 18, 16)), SYSTEM.views((40, 40))
+    mu = None if settings else mph.Volume(rng.uniform(0, 0.02, grid.shape), grid, "mu")
+    model = mph.Emission(SYSTEM, mu, hole="depth", **settings)
+    x, part = rng.random(grid.shape), np.zeros(grid.shape)
+    part[7:12, :, 5:9] = x[7:12, :, 5:9]
+    A = mph.Projector(grid, views, model, double=True)
+    small, rest, whole = A(part), A(x - part), A(x)
+    np.testing.assert_allclose(small + rest, whole, rtol=0, atol=(1e-12 if settings else 1e-4) * whole.max())
+    np.testing.assert_array_equal(mph.Projector(grid, views, model, double=True)(part), small)
 
 
 @pytest.mark.parametrize("changes", [
@@ -332,7 +319,17 @@ def test_a_hole_is_a_hole_unless_a_point_is_asked_for(rng):
     np.testing.assert_array_equal(plain, depth)
     assert plain.max() < 0.6 * point.max()
     assert plain.sum() == pytest.approx(point.sum(), rel=0.02)
-    refused(lambda: mph.Emission(SYSTEM, hole="point", aperture_points=7), "hole 'point' takes no points")
+
+
+def test_what_it_does_not_take_is_refused():
+    near = depth_projector(mph.Grid.centered((4, 4, 4), 90.0), 8)
+    for call, *words in (
+        (lambda: mph.Emission(SYSTEM, hole="cone"), "hole: expected 'auto', 'depth', 'rays' or 'point'"),
+        (lambda: mph.Emission(SYSTEM, hole="depth", aperture_points=7), "hole 'depth' takes no points"),
+        (lambda: mph.Emission(SYSTEM, hole="point", aperture_points=7), "hole 'point' takes no points"),
+        (lambda: near(np.ones(near.shape_in)), "take a smaller grid", "hole 'auto' or 'rays'"),
+    ):
+        refused(call, *words)
 
 
 def transmitted(mu, edges, at, m, n=40_000):
@@ -367,7 +364,7 @@ def test_attenuation_of_a_thin_shell_beside_air_is_within_one_per_cent(coefficie
     shapes = [mph.Cylinder(radius=70, height=140, mu=0.0154), *spheres]
     mu = mph.ShapePhantom(shapes).voxelize(mph.Grid.centered(round(150 / size), size), quantity="mu")
     grid = mph.Grid.centered(round(100 / voxel), voxel, (0.3, 0.4, -0.2))
-    radius = np.linalg.norm(centres(grid), axis=-1)
+    radius = np.linalg.norm(voxel_centers(grid), axis=-1)
     assert worst_share_off(mu, grid, (radius > 30) & (radius < 44), rng, 15) < 0.01
 
 
@@ -379,5 +376,5 @@ def test_attenuation_of_a_chest_is_within_one_per_cent(rng):
     affine = mu.grid.affine.copy()
     affine[:3, 3] -= mu.grid.center
     grid = mph.Grid(mu.grid.shape, affine)
-    middle = np.linalg.norm(centres(grid), axis=-1) < 75
+    middle = np.linalg.norm(voxel_centers(grid), axis=-1) < 75
     assert worst_share_off(mph.Volume(mu.array, grid, "mu"), grid, middle, rng, 40) < 0.01

@@ -8,8 +8,8 @@ import pytest
 import mphdrr.core as mph
 from mphdrr.core.errors import InputError
 
-from .conftest import emission, general_grid
-from .test_emission import BACKENDS, assert_adjoint, one_module, turned_grid
+from .conftest import BACKENDS
+from .test_emission import one_module, turned_grid
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
@@ -35,34 +35,6 @@ def test_one_voxel_is_its_chord_times_the_sensitivity_at_its_middle(backend):
     np.testing.assert_allclose(images.reshape(-1), expected, rtol=2e-5, atol=2e-5 * expected.max())
     behind = mph.Grid.centered((2, 2, 2), 10.0, (250, 0, 0))
     assert not mph.Projector(behind, views, mph.InverseSquareSum(system), backend)(np.ones((2, 2, 2))).any()
-
-
-@pytest.mark.parametrize("backend", BACKENDS)
-def test_adjoint_of_the_inverse_square_sum(backend, system, rng):
-    grid = general_grid(rng, (9, 8, 7))
-    A = mph.Projector(grid, system[3:6].views((10, 11)), mph.InverseSquareSum(system[3:6]), backend, threads=2)
-    assert_adjoint(A, rng)
-
-
-def test_gradient_in_the_activity_is_the_adjoint(rng):
-    torch = pytest.importorskip("torch", reason="torch is not installed")
-    grid = turned_grid((3, 2, 2), 20.0)
-    A = mph.Projector(grid, one_module().views((3, 3)), mph.InverseSquareSum(one_module()), "numpy")
-    x = torch.rand(grid.shape, dtype=torch.float64, requires_grad=True)
-    assert torch.autograd.gradcheck(lambda x: torch.log1p(1e4 * A(x)), (x,))
-
-
-def test_it_is_not_the_law_of_a_point_source(rng):
-    """Total counts of a spot fall with the fourth power of its height: `Emission`'s with the second."""
-    system = one_module()
-
-    def total(model, x):
-        grid = turned_grid((3, 3, 3), 0.8, (x, 0, 0))
-        views = system.views((150, 150), "real", pitch=0.02)
-        return mph.Projector(grid, views, model)(np.ones((3, 3, 3))).sum(dtype=float)
-
-    for model, power in ((emission(system), 2), (mph.InverseSquareSum(system), 4)):
-        assert total(model, 60.0) / total(model, -60.0) == pytest.approx((260 / 140) ** power, rel=0.02)
 
 
 @pytest.mark.parametrize("photons", [1.0, 1e5])

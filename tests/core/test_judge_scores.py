@@ -1,7 +1,5 @@
 """Scores of the judge: right for the truth, whatever the counts, the pose and the place."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from types import SimpleNamespace
@@ -43,20 +41,17 @@ def test_the_expected_deviance_has_its_limits():
 
 
 WATER = {"cylinder_radius": 40.0, "background": 20.0}
+DIAMETERS = (11.0, 10.0, 9.0, 8.0, 7.0, 6.0)
 
 
 def test_rods_of_the_truth_have_all_of_their_contrast_and_empty_places_none():
-    phantom = mph.DerenzoPhantom(
-        36.0, (11.0, 10.0, 9.0, 8.0, 7.0, 6.0), 30.0, activity=80.0, cylinder_radius=40.0, background=20.0
-    )
-    pose = mph.random_pose(4, box=4)
+    phantom, pose = mph.DerenzoPhantom(36.0, DIAMETERS, 30.0, activity=80.0, **WATER), mph.random_pose(4, box=4)
     truth = phantom.voxelize(mph.Grid.centered((120,) * 3, 0.8), pose)
-    np.testing.assert_allclose(rod_contrasts(truth, phantom, pose, phantom.rods()), 1, atol=0.12)
     half = mph.Volume(0.5 * truth.array + 3, truth.grid, "activity")
-    np.testing.assert_allclose(rod_contrasts(half, phantom, pose, phantom.rods()), 0.5, atol=0.06)
-    water = mph.DerenzoPhantom(36.0, (11.0, 0, 0, 0, 0, 0), 30.0, activity=20.0, cylinder_radius=40.0, background=20.0)
-    empty = water.voxelize(truth.grid, pose)
-    np.testing.assert_allclose(rod_contrasts(empty, phantom, pose, phantom.rods()), 0, atol=0.01)
+    water = mph.DerenzoPhantom(36.0, (11.0, 0, 0, 0, 0, 0), 30.0, activity=20.0, **WATER).voxelize(truth.grid, pose)
+    for volume, contrast, tolerance in ((truth, 1, 0.12), (half, 0.5, 0.06), (water, 0, 0.01)):
+        contrasts = rod_contrasts(volume, phantom, pose, phantom.rods())
+        np.testing.assert_allclose(contrasts, contrast, atol=tolerance)
 
 
 @pytest.mark.long
@@ -64,24 +59,19 @@ def test_rods_of_the_truth_have_all_of_their_contrast_and_empty_places_none():
 def test_mixtures_follow_from_their_seed_and_stay_in_their_ball(look, monkeypatch):
     monkeypatch.setattr(painting, "_SAMPLES_OF_OVERLAP", 1 << 13)  # totals to some percent are enough
     grid = mph.Grid.centered((24, 24, 24), 5.0)
-    one, again, other = (
-        mph.MixturePhantom(seed=seed, number=10, radius=40, look=look).voxelize(grid).array for seed in (1, 1, 2)
-    )
-    np.testing.assert_array_equal(one, again)
-    assert not np.array_equal(one, other)
+    phantoms = (mph.MixturePhantom(seed=seed, number=10, radius=40, look=look) for seed in (1, 1, 2))
+    array, same, other = (phantom.voxelize(grid).array for phantom in phantoms)
+    np.testing.assert_array_equal(array, same)
+    assert not np.array_equal(array, other)
     distance = np.linalg.norm(np.moveaxis(np.indices(grid.shape), 0, -1) * 5.0 + grid.affine[:3, 3], axis=-1)
-    assert one.any() and not one[distance > 40 + 5].any()
+    assert array.any() and not array[distance > 40 + 5].any()
 
 
 @pytest.mark.parametrize("diameters", [(11.5, 10.5, 9.5, 8.5, 7.5, 6.5), (7.5, 5.5, 6.5, 11.5, 5.5, 8.5)])
-@pytest.mark.parametrize(
-    ("altered", "water"),
-    [(altered, WATER if altered in (1, 6, -2, -4) else {}) for altered in (1, 2, 4, 6, -1, -2, -4, -6)],
-)
-def test_the_truth_has_all_of_the_contrast_of_an_added_rod_and_none_of_one_left_out(
-    diameters, altered, water, monkeypatch
-):
+@pytest.mark.parametrize("altered", [1, 2, 4, 6, -1, -2, -4, -6])
+def test_the_truth_has_all_of_the_contrast_of_an_added_rod_and_none_of_one_left_out(diameters, altered, monkeypatch):
     """Of the phantom's own values, to rounding; of voxels of 0.8 mm, to their partial volumes."""
+    water = WATER if altered in (1, 6, -2, -4) else {}
     phantom = mph.DerenzoPhantom(34.0, diameters, 30.0, activity=80.0, altered=altered, **water)
     pose, expected = mph.random_pose(5, box=4), float(altered < 0)
     site = [phantom.altered_site()]
@@ -94,7 +84,7 @@ def test_the_truth_has_all_of_the_contrast_of_an_added_rod_and_none_of_one_left_
 
 def scores_of_pairs(altered, factor):
     """The scores of volumes that show a share `factor` of every rod, also of one that is left out."""
-    phantom = mph.DerenzoPhantom(36.0, (11.0, 10.0, 9.0, 8.0, 7.0, 6.0), 30.0, activity=80.0, altered=altered)
+    phantom = mph.DerenzoPhantom(36.0, DIAMETERS, 30.0, activity=80.0, altered=altered)
     planned = SimpleNamespace(phantom=phantom, activity_factor=1.0)
     event = SimpleNamespace(planned=planned, placement=np.eye(4), number=0, name="derenzo")
     volume = dataclasses.replace(phantom, altered=min(altered, 0)).voxelize(mph.Grid.centered((60,) * 3, 1.6))
@@ -103,12 +93,11 @@ def scores_of_pairs(altered, factor):
 
 
 def test_false_rods_are_counted_where_a_rod_is_missing():
-    rows = [scores_of_pairs(altered, 0.9) for altered in (1, 2, 3, -4)]
-    blind = [scores_of_pairs(altered, 0.2) for altered in (1, 2, 3, -4)]
-    found = mean_scores(rows)
-    assert found["false_rods"].value == 1 and found["sites"] == 4 and found["sensitivity"].value == 1
-    assert mean_scores(blind)["false_rods"].value == 0 and mean_scores(blind)["sensitivity"].value == 0
+    rows, blind = ([scores_of_pairs(altered, factor) for altered in (1, 2, 3, -4)] for factor in (0.9, 0.2))
+    means, blind_means = mean_scores(rows), mean_scores(blind)
+    assert means["false_rods"].value == 1 and means["sites"] == 4 and means["sensitivity"].value == 1
+    assert blind_means["false_rods"].value == 0 and blind_means["sensitivity"].value == 0
     beside = compare_scores(rows, blind, 0)
     assert beside["false_rods_more"] == (1, 1, 1) and beside["ratio"].value == pytest.approx(0.1 / 0.8)
-    assert "4 altered sites, fewer than 200" in row_notes(found)
+    assert "4 altered sites, fewer than 200" in row_notes(means)
     assert scores_of_pairs(0, 1.0).keys() == {"nrmse", "megabytes"}

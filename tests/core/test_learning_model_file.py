@@ -1,15 +1,10 @@
 """Model files: sealed, without code, and refused where they do not fit; networks as methods of reconstruction."""
 
-from __future__ import annotations
-
 import io
 import json
 import os
 import pickle
-import subprocess
-import sys
 import time
-import warnings
 import zipfile
 from dataclasses import replace
 from pathlib import Path
@@ -18,9 +13,7 @@ import nibabel
 import numpy as np
 import pytest
 
-pytest.importorskip(
-    "lightning", reason="networks are trained with the extra learning, for which there is no torch here"
-)
+pytest.importorskip("lightning", reason="the extra learning is not installed")
 import torch
 
 import mphdrr.core as mph
@@ -28,11 +21,12 @@ from mphdrr.core.cli import main
 from mphdrr.core.events import EventSet
 from mphdrr.core.learning import model_file
 from mphdrr.core.learning.judging.sets import events_by_recipe
-from mphdrr.core.learning.model_file import ModelContents, read_model, seal, write_model
+from mphdrr.core.learning.model_file import read_model, seal, write_model
 from mphdrr.core.learning.networks import NETWORKS
 from mphdrr.core.reconstruction.methods import method_of
 from mphdrr.core.reconstruction.snapshots import Snapshots
 
+from .conftest import refused, refused_command, run_python
 from .small_events import TEXT, small_recipe
 from .small_learning import TOY, small_training
 from .small_recipes import JUDGE
@@ -59,12 +53,6 @@ def run(folder) -> mph.ProjectionRun:
     return EventSet(folder / "set")[0].run("emission", noise_seed=3)
 
 
-def refused(capsys, *arguments: object) -> str:
-    assert main(["reconstruct", *map(str, arguments)]) == 1
-    line = capsys.readouterr().err.splitlines()[-1]
-    return line.removeprefix("mphdrr: ")
-
-
 def with_fewer_modules(run: mph.ProjectionRun) -> mph.ProjectionRun:
     """A run of another scanner: the last two modules are left out."""
     which = np.arange(len(run.system) - 2)
@@ -84,62 +72,54 @@ class Harmful:
 def test_every_changed_byte_is_refused(folder, model, tmp_path):
     data, path = (folder / "model.pt").read_bytes(), tmp_path / "m.pt"
     places = np.random.default_rng(0).integers(0, len(data), 200).tolist()
+    said = r"m\.pt: (damaged: its bytes are not those|no model file of mphDRR, or cut)"
     for place in [*places, *range(len(data) - 110, len(data))]:
         path.write_bytes(data[:place] + bytes([data[place] ^ 1 << place % 8]) + data[place + 1 :])
-        with pytest.raises(
-            mph.InputError, match=r"m\.pt: (damaged: its bytes are not those|no model file of mphDRR, or cut)"
-        ):
+        with pytest.raises(mph.InputError, match=said):
             read_model(path)
     for size in (0, 10, len(data) // 2, len(data) - 1):
         path.write_bytes(data[:size])
-        with pytest.raises(mph.InputError, match=r"m\.pt: no model file of mphDRR, or cut: its seal is missing"):
-            read_model(path)
+        refused(lambda: read_model(path), "m.pt: no model file of mphDRR, or cut: its seal is missing")
     path.write_bytes(data + b" ")
-    with pytest.raises(mph.InputError):
-        read_model(path)
+    refused(lambda: read_model(path))
+
+
+def saved(content: object) -> bytes:
+    """Return the bytes of what torch saves."""
+    memory = io.BytesIO()
+    torch.save(content, memory)
+    return memory.getvalue()
 
 
 def test_a_pickled_object_is_refused_and_not_run(folder, model, tmp_path):
-    known = torch.load(folder / "model.pt", weights_only=True)
-    for number, content in enumerate((Harmful(tmp_path / "harm"), {**known, "about": Harmful(tmp_path / "harm")})):
-        memory, path = io.BytesIO(), tmp_path / f"{number}.pt"
-        torch.save(content, memory)
-        path.write_bytes(memory.getvalue())
-        with pytest.raises(mph.InputError, match="its seal is missing"):
-            read_model(path)
-        path.write_bytes(seal(memory.getvalue()))  # by one who knows how
-        with pytest.raises(mph.InputError) as refusal:
-            read_model(path)
-        assert "it holds more than numbers and texts, nothing of which was run" in str(refusal.value)
-        assert "\n" not in str(refusal.value)
-    (tmp_path / "plain.pt").write_bytes(pickle.dumps(Harmful(tmp_path / "harm")))
-    with pytest.raises(mph.InputError):
-        read_model(tmp_path / "plain.pt")
+    harm, path = Harmful(tmp_path / "harm"), tmp_path / "m.pt"
+    for content in (harm, {**torch.load(folder / "model.pt", weights_only=True), "about": harm}):
+        path.write_bytes(saved(content))
+        refused(lambda: read_model(path), "its seal is missing")
+        path.write_bytes(seal(saved(content)))  # by one who knows how
+        refused(lambda: read_model(path), "it holds more than numbers and texts, nothing of which was run")
+    path.write_bytes(pickle.dumps(harm))
+    refused(lambda: read_model(path))
     assert not (tmp_path / "harm").exists()
 
 
-@pytest.mark.parametrize(
-    ("changes", "words"),
-    [
-        ({"version": 2}, "format 2; this mphDRR reads 1, a newer one may read it"),
-        ({"format": "another"}, "no model file of mphDRR"),
-        ({"about": "{}"}, "cannot be read as a model file"),
-        ({"about": "[1]"}, "cannot be read as a model file"),
-    ],
-)
-def test_other_formats_are_refused_in_a_line(folder, model, tmp_path, changes, words):
-    memory = io.BytesIO()
-    torch.save({**torch.load(folder / "model.pt", weights_only=True), **changes}, memory)
-    (tmp_path / "m.pt").write_bytes(seal(memory.getvalue()))
-    with pytest.raises(mph.InputError, match=words):
-        read_model(tmp_path / "m.pt")
+def test_other_formats_are_refused_in_a_line(folder, model, tmp_path):
+    path = tmp_path / "m.pt"
+    for key, value, words in (
+        ("version", 2, "format 2; this mphDRR reads 1, a newer one may read it"),
+        ("format", "another", "no model file of mphDRR"),
+        ("about", "{}", "cannot be read as a model file"),
+        ("about", "[1]", "cannot be read as a model file"),
+    ):
+        path.write_bytes(seal(saved({**torch.load(folder / "model.pt", weights_only=True), key: value})))
+        refused(lambda: read_model(path), words)
 
 
 def test_weights_of_another_network_are_refused(model, tmp_path):
     weights = {**model.contents.weights, "more.weight": torch.zeros(3)}
     write_model(replace(model.contents, weights=weights), tmp_path / "m.pt")
-    with pytest.raises(mph.InputError, match="cannot be read as weights of this version's network"):
-        _ = read_model(tmp_path / "m.pt").network
+    unusable = read_model(tmp_path / "m.pt")
+    refused(lambda: unusable.network, "cannot be read as weights of this version's network")
 
 
 def test_a_file_holds_what_the_network_was_trained_on_and_is_a_zip_for_torch(folder, model):
@@ -166,63 +146,52 @@ def test_networks_of_one_setup_share_osems_volumes_and_say_the_seconds_that_it_s
     monkeypatch.setattr(model_file, "_SETUPS", {})
     weights = {name: 2 * values for name, values in model.contents.weights.items()}
     write_model(replace(model.contents, weights=weights), tmp_path / "double.pt")
-    double, asked, whole = read_model(tmp_path / "double.pt"), [], Snapshots.__call__
-
-    def counted(snapshots, counts, after, background):
-        asked.append(snapshots)
-        return whole(snapshots, counts, after, background)
-
-    monkeypatch.setattr(Snapshots, "__call__", counted)
-    first, second = model.judged("first"), double.judged("second")
+    calls, osem = [], Snapshots.__call__
+    monkeypatch.setattr(Snapshots, "__call__", lambda *arguments: calls.append(arguments) or osem(*arguments))
+    first, second = model.judged("first"), read_model(tmp_path / "double.pt").judged("second")
     begun = time.perf_counter()
     one = first.function(run)
     spent = time.perf_counter() - begun
     assert first.saved() == 0
     other = second.function(run)
-    assert len(asked) == 1 and 0 < second.saved() < spent
+    assert len(calls) == 1 and 0 < second.saved() < spent
     second.function(replace(run, projections=2 * run.projections))
-    assert len(asked) == 2 and second.saved() == 0
+    assert len(calls) == 2 and second.saved() == 0
     model_file._SETUPS.clear()  # nothing is shared
     np.testing.assert_array_equal(second.function(run).array, other.array)
-    assert len(asked) == 3 and second.saved() == 0 and not np.array_equal(one.array, other.array)
+    assert len(calls) == 3 and second.saved() == 0 and not np.array_equal(one.array, other.array)
 
 
+@pytest.mark.filterwarnings("ignore::mphdrr.core.errors.InputWarning")
 def test_the_network_is_what_was_trained(folder, model, run):
     volume = model(run)
-    assert volume.grid == model.contents.grid and volume.quantity == "activity"
-    event = EventSet(folder / "set")[0]
-    truth = mph.resample(event.truth, volume.grid, "mean")
+    assert volume.grid == model.contents.grid == method_of(str(model.path)).grid and volume.quantity == "activity"
+    truth = mph.resample(EventSet(folder / "set")[0].truth, volume.grid, "mean")
     assert mph.nrmse(volume, truth) < 1
-    double = replace(
-        run, projections=2 * run.projections, background=2 * run.background
-    )  # twice the counts, twice the activity
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", mph.InputWarning)
-        assert np.corrcoef(model(double).array.ravel(), volume.array.ravel())[0, 1] > 0.99
+    # Twice the counts, twice the activity.
+    double = replace(run, projections=2 * run.projections, background=2 * run.background)
+    assert np.corrcoef(model(double).array.ravel(), volume.array.ravel())[0, 1] > 0.99
 
 
 def test_another_scanner_grid_or_physics_is_refused_or_allowed_by_name(folder, model, run):
-    other = with_fewer_modules(run)
-    with pytest.raises(mph.InputError) as refusal:
-        model(other)
-    said = f"{folder / 'model.pt'}: trained for another scanner; --allow scanner takes it anyway"
-    assert str(refusal.value) == said
+    method = {"reconstruction.method": str(folder / "model.pt")}
+    other, other_grid = with_fewer_modules(run), run.recipe.updated({**method, "reconstruction.spacing": 11.0})
+    physics = {"model.intrinsic_fwhm": 3.0, "model.time": 50.0, "model.background": 0.5}
+    blurred = run.recipe.updated({**method, **physics})
+    for call, words in (
+        (lambda: model(other), f"{folder / 'model.pt'}: trained for another scanner; --allow scanner takes it anyway"),
+        (lambda: mph.reconstruct_run(run, other_grid), "trained for another grid; --allow grid takes it anyway"),
+        (lambda: mph.reconstruct_run(run, blurred), "trained for another physics; --allow physics takes it anyway"),
+        (lambda: model(run, allow=("time",)), "expected one of scanner, grid, physics, got 'time'"),
+    ):
+        refused(call, words)
     with pytest.warns(mph.InputWarning, match=r"model\.pt was trained for another scanner, which was allowed"):
         assert model(other, allow=("scanner",)).grid == model.contents.grid
-    recipe = run.recipe.updated({"reconstruction.method": str(folder / "model.pt"), "reconstruction.spacing": 11.0})
-    with pytest.raises(mph.InputError, match="trained for another grid; --allow grid takes it anyway"):
-        mph.reconstruct_run(run, recipe)
-    allowed = recipe.updated({"reconstruction.allow": ("grid",), "reconstruction.voxels": 10})
+    allowed = other_grid.updated({"reconstruction.allow": ("grid",), "reconstruction.voxels": 10})
     with pytest.warns(mph.InputWarning):
-        found = mph.reconstruct_run(run, allowed)
-    assert found.volume.array.shape == (10, 10, 10)
-    assert found.settings["allow"] == ["grid"]
-    assert "model.pt was trained for another grid, which was allowed" in found.settings["flatters"]
-    blurred = run.recipe.updated({"model.intrinsic_fwhm": 3.0, "model.time": 50.0, "model.background": 0.5})
-    with pytest.raises(mph.InputError, match="trained for another physics; --allow physics takes it anyway"):
-        mph.reconstruct_run(run, blurred.updated({"reconstruction.method": str(folder / "model.pt")}))
-    with pytest.raises(mph.InputError, match="expected one of scanner, grid, physics, got 'time'"):
-        model(run, allow=("time",))
+        result = mph.reconstruct_run(run, allowed)
+    assert result.volume.array.shape == (10, 10, 10) and result.settings["allow"] == ["grid"]
+    assert "model.pt was trained for another grid, which was allowed" in result.settings["flatters"]
 
 
 def test_another_time_is_no_other_physics_but_far_fewer_counts_are_said(model, run):
@@ -242,42 +211,36 @@ def test_the_command_line_reconstructs_with_a_model_and_says_so(folder, model, r
     assert "Network model.pt (Toy), 8 x 8 x 8 voxels of 12 mm, largest " in out.out
     assert ">Network model.pt (Toy)" in (tmp_path / "p.svg").read_text(encoding="utf-8")
     np.testing.assert_allclose(mph.read_volume(tmp_path / "v.nii.gz").array, model(run).array, rtol=1e-6)
-    said = f"Reconstructed by a network model.pt (Toy), sha256 {model.sha256}"
-    assert nibabel.load(tmp_path / "v.nii.gz").header.extensions[0].text == said
-    assert model(run).note == said
-    kept = mph.read_reconstruction(tmp_path / "s.h5").settings
-    assert kept["sha256"] == model.sha256 and kept["network"] == "toy" and kept["allow"] == []
-    assert kept["method"] == "Network model.pt (Toy)"
-    said = refused(capsys, *command, "--voxels", "12", "-o", tmp_path / "no.nii")
-    assert said == f"{folder / 'model.pt'}: trained for another grid; --allow grid takes it anyway"
-    assert "Network model.pt (Toy) does not take it" in refused(
-        capsys, *command, "--subsets", "2", "-o", tmp_path / "no.nii"
-    )
-    said = refused(capsys, tmp_path / "run.npz", "--allow", "grid", "-o", tmp_path / "no.nii")
-    assert said == "reconstruction.allow (--allow) needs reconstruction.method = FILE.pt"
-    assert refused(capsys, tmp_path / "run.npz", "--method", "none.pt", "-o", tmp_path / "no.nii").endswith(
-        "none.pt: no such file"
-    )
+    note = f"Reconstructed by a network model.pt (Toy), sha256 {model.sha256}"
+    assert nibabel.load(tmp_path / "v.nii.gz").header.extensions[0].text == model(run).note == note
+    settings = mph.read_reconstruction(tmp_path / "s.h5").settings
+    assert settings["sha256"] == model.sha256 and settings["network"] == "toy" and settings["allow"] == []
+    assert settings["method"] == "Network model.pt (Toy)"
+    other_grid = f"{folder / 'model.pt'}: trained for another grid; --allow grid takes it anyway"
+    for words, said in (
+        ([*command, "--voxels", "12"], other_grid),
+        ([*command, "--subsets", "2"], "Network model.pt (Toy) does not take it"),
+        ([command[0], "--allow", "grid"], "reconstruction.allow (--allow) needs reconstruction.method = FILE.pt"),
+        ([command[0], "--method", "none.pt"], "none.pt: no such file"),
+    ):
+        assert said in refused_command(capsys, "reconstruct", *words, "-o", tmp_path / "no.nii")
     assert not (tmp_path / "no.nii").exists()
 
 
+@pytest.mark.filterwarnings("error::mphdrr.core.errors.InputWarning")
 def test_a_model_is_judged_under_a_name_without_warnings(model, run):
     method = model.judged("toy")
     assert method.name == "toy" and method.trained_on == model.contents.trained_on["events"]
-    with warnings.catch_warnings():
-        warnings.simplefilter("error", mph.InputWarning)
-        found = method.function(with_fewer_modules(run))
-    assert found.grid == model.contents.grid
+    assert method.function(with_fewer_modules(run)).grid == model.contents.grid
 
 
 def test_other_holes_are_another_scanner(folder, model, run, monkeypatch):
     """They change no view, and no setting of the physics."""
     monkeypatch.setattr(model_file, "_SETUPS", {})
     wider = replace(run, system=run.system.replace(pinhole_diameter=1.5 * run.system.pinhole_diameter))
-    with pytest.raises(mph.InputError, match="trained for another scanner; --allow scanner takes it anyway"):
-        model(wider)
+    refused(lambda: model(wider), "trained for another scanner; --allow scanner takes it anyway")
     with pytest.warns(mph.InputWarning, match="trained for another scanner"):
-        _, after = (model(each, allow=("scanner",)) for each in (run, wider))
+        _, after = (model(scan, allow=("scanner",)) for scan in (run, wider))
         model_file._SETUPS.clear()
         alone = model(wider, allow=("scanner",))
     np.testing.assert_array_equal(after.array, alone.array)
@@ -301,7 +264,7 @@ def test_permuted_poses_are_those_of_the_training(folder, model, run, tmp_path):
 
 
 def test_without_torch_a_model_is_refused_in_a_line_and_core_does_not_need_it():
-    script = """
+    done = run_python("""
 import sys
 sys.modules["torch"] = None
 import mphdrr.core as mph
@@ -311,31 +274,20 @@ try:
 except mph.InputError as error:
     print(error)
 print(main(["learn", "train", "r.toml", "-o", "out/m.pt"]), file=sys.stderr)
-"""
-    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+""")
+    assert done.returncode == 0
     assert done.stdout.splitlines()[0] == 'torch is missing: pip install "mphdrr[learning]"'
 
 
-def test_contents_are_all_there_is(model):
-    assert {*ModelContents.__annotations__} == {
-        "weights", "recipe", "scanner", "shape", "affine", "physics", "fixed", "counts", "trained_on", "curve", "judgement",
-        "versions",
-    }  # fmt: skip
-    assert method_of(str(model.path)).grid == model.contents.grid
-
-
-OWN_JUDGE = JUDGE.replace("voxels = 12\nspacing = 8.0", "voxels = 8\nspacing = 12.0")
-OWN_JUDGE = (
-    OWN_JUDGE.replace('"validation"', '"set"\nsplit = "test"')
-    + """
+OWN_JUDGE = f"""
+{JUDGE.replace("voxels = 12", "voxels = 8").replace("spacing = 8.0", "spacing = 12.0")}
 [models]
 net = "net.pt"
 [[tests]]
 name = "others"
 events = "others"
 levels = [1.0, 0.5]
-"""
-)
+""".replace('"validation"', '"set"\nsplit = "test"')
 
 
 def test_a_model_is_judged_by_the_command_beside_baselines_and_may_keep_its_rows(folder, model, tmp_path, capsys):
@@ -347,11 +299,10 @@ def test_a_model_is_judged_by_the_command_beside_baselines_and_may_keep_its_rows
     assert main(command) == 0
     assert " in judgement.md, .json and .png" in capsys.readouterr().out
     rows = json.loads((tmp_path / "judgement" / "judgement.json").read_text(encoding="utf-8"))["rows"]
-    own = [row for row in rows if row["method"] == "net"]
-    assert [row["level"] for row in own] == [1.0, 0.5] and all(0 < row["nrmse"] < 1 for row in own)
-    assert mph.learning.read_model(tmp_path / "net.pt").contents.judgement["rows"] == own
-    (tmp_path / "judge.toml").write_text(
-        OWN_JUDGE.replace('"others"\nlevels', '"set"\nsplit = "train"\nlevels'), encoding="utf-8"
-    )
+    net_rows = [row for row in rows if row["method"] == "net"]
+    assert [row["level"] for row in net_rows] == [1.0, 0.5] and all(0 < row["nrmse"] < 1 for row in net_rows)
+    assert mph.learning.read_model(tmp_path / "net.pt").contents.judgement["rows"] == net_rows
+    on_itself = OWN_JUDGE.replace('"others"\nlevels', '"set"\nsplit = "train"\nlevels')
+    (tmp_path / "judge.toml").write_text(on_itself, encoding="utf-8")
     assert main(command) == 1
     assert "net: it was trained on events of the test others" in capsys.readouterr().err

@@ -1,7 +1,5 @@
 """The study's recipes are understood, and go together: what is judged is trained, on sets that are made."""
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 
@@ -24,9 +22,9 @@ TRAININGS = study.trainings(False) + study.trainings(True)
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    found = tmp_path_factory.mktemp("study")
-    study.scanners(found)
-    return found
+    folder = tmp_path_factory.mktemp("study")
+    study.scanners(folder)
+    return folder
 
 
 @pytest.mark.parametrize("name", study.EVENTS)

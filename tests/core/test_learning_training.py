@@ -1,7 +1,5 @@
 """Trainings: what they learn from, that they go on as if they had not stopped, and that processes share them."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import os
@@ -9,16 +7,13 @@ import re
 import signal
 import subprocess
 import sys
-import textwrap
 import time
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-pytest.importorskip(
-    "lightning", reason="networks are trained with the extra learning, for which there is no torch here"
-)
+pytest.importorskip("lightning", reason="the extra learning is not installed")
 import torch
 
 import mphdrr
@@ -30,6 +25,7 @@ from mphdrr.core.learning.networks import NETWORKS
 from mphdrr.core.learning.recipe import parse_recipe, template_text
 from mphdrr.core.learning.training import nrmse, training_loss
 
+from .conftest import refused, refused_command
 from .small_learning import TOY, small_training
 from .small_recipes import TRAINING
 
@@ -45,14 +41,8 @@ def changed(recipe, before: str, after: str):
     return parse_recipe(recipe.text.replace(before, after), "training.toml", recipe.folder)
 
 
-def refused(capsys, *arguments: object) -> str:
-    assert main(["learn", *map(str, arguments)]) == 1
-    (line,) = capsys.readouterr().err.splitlines()
-    return line.removeprefix("mphdrr: ")
-
-
-def same(one: mph.learning.TrainedNetwork, other: mph.learning.TrainedNetwork) -> bool:
-    a, b = one.contents.weights, other.contents.weights
+def same_weights(first: mph.learning.TrainedNetwork, second: mph.learning.TrainedNetwork) -> bool:
+    a, b = first.contents.weights, second.contents.weights
     return a.keys() == b.keys() and all(torch.equal(a[name], b[name]) for name in a)
 
 
@@ -73,9 +63,7 @@ def same(one: mph.learning.TrainedNetwork, other: mph.learning.TrainedNetwork) -
     ],
 )  # fmt: skip
 def test_a_recipe_that_cannot_be_used_is_refused_in_a_line(recipe, before, after, words):
-    with pytest.raises(mph.InputError) as refusal:
-        changed(recipe, before, after)
-    assert str(refusal.value).startswith(f"training.toml: {words}")
+    refused(lambda: changed(recipe, before, after), f"training.toml: {words}")
 
 
 _WRONG = {bool: (0, "x"), int: (0, -1, 1.5, "x"), float: (0, -1.0, float("inf"), "x"), str: (3, False)}
@@ -85,16 +73,15 @@ _MAY_BE_0 = ("network.features", "network.neighbours", "network.permuted", "trai
 
 @pytest.mark.parametrize("kind", ["after-osem", "cameras", "parallel", "unrolled", "channels"])
 def test_nonsense_in_any_setting_of_any_network_is_refused_with_its_table_and_name(recipe, kind):
-    given = {**recipe.given, "network.kind": kind}
-    rows = dataclasses.replace(recipe, given=given).rows
+    settings = {**recipe.given, "network.kind": kind}
+    rows = dataclasses.replace(recipe, given=settings).rows
     assert len(rows) > 20
     for key, row in rows.items():
         for wrong in _WRONG[row.kind]:
             if key == "grid.center" or (wrong == 0 and key in _MAY_BE_0):
                 continue
-            with pytest.raises(mph.InputError, match=f"^{key}: expected ") as refusal:
-                dataclasses.replace(recipe, given={**given, key: wrong if row.sizes is None else [wrong]})
-            assert "\n" not in str(refusal.value)
+            nonsense = {**settings, key: wrong if row.sizes is None else [wrong]}
+            refused(lambda given=nonsense: dataclasses.replace(recipe, given=given), f"{key}: expected ")
 
 
 @pytest.mark.parametrize(
@@ -115,29 +102,29 @@ def test_what_a_scanner_a_set_or_lightning_does_not_take_is_refused_by_the_comma
     recipe, tmp_path, capsys, kind, setting, words
 ):
     table, _, line = setting.partition(".")
-    kept = [text for text in recipe.text.splitlines() if text.partition(" ")[0] != line.partition(" ")[0]]
-    text = "\n".join(kept).replace(f"[{table}]", f"[{table}]\n{line}").replace('kind = "toy"', f'kind = "{kind}"')
+    others = [text for text in recipe.text.splitlines() if text.partition(" ")[0] != line.partition(" ")[0]]
+    text = "\n".join(others).replace(f"[{table}]", f"[{table}]\n{line}").replace('kind = "toy"', f'kind = "{kind}"')
     (tmp_path / "wrong.toml").write_text(text, encoding="utf-8")
-    said = refused(capsys, "train", tmp_path / "wrong.toml", "-o", tmp_path / "m.pt", "--quiet")
-    assert re.search(words, said)
+    command = ["learn", "train", tmp_path / "wrong.toml", "-o", tmp_path / "m.pt", "--quiet"]
+    assert re.search(words, refused_command(capsys, *command))
 
 
 def test_a_network_takes_the_settings_that_its_class_has(recipe):
-    given = changed(recipe, 'kind = "toy"', 'kind = "toy"\nchannels = 3\nkernels = [5, 3]\nleaky = false')
-    assert given.network == {"channels": 3, "kernels": (5, 3), "leaky": False}
+    special = changed(recipe, 'kind = "toy"', 'kind = "toy"\nchannels = 3\nkernels = [5, 3]\nleaky = false')
+    assert special.network == {"channels": 3, "kernels": (5, 3), "leaky": False}
     assert recipe.network == {}
-    assert given.fingerprint != recipe.fingerprint == changed(recipe, "threads = 1", "threads = 2").fingerprint
+    assert special.fingerprint != recipe.fingerprint == changed(recipe, "threads = 1", "threads = 2").fingerprint
 
 
 def test_the_recipe_to_begin_with_is_one_for_each_network(tmp_path, monkeypatch, capsys):
     monkeypatch.setitem(NETWORKS, "toy", TOY)
     assert parse_recipe(template_text("toy"))["network.kind"] == "toy"
-    assert main(["learn", "new", "--like", "unrolled", "-o", str(tmp_path / "new.toml")]) == 0
-    assert 'kind = "unrolled"' in (tmp_path / "new.toml").read_text(encoding="utf-8")
+    path = tmp_path / "new.toml"
+    assert main(["learn", "new", "--like", "unrolled", "-o", str(path)]) == 0
+    assert 'kind = "unrolled"' in path.read_text(encoding="utf-8")
     capsys.readouterr()
-    assert refused(capsys, "new", "-o", tmp_path / "new.toml").endswith(
-        "it exists; choose another name, or remove it first"
-    )
+    said = "it exists; choose another name, or remove it first"
+    assert refused_command(capsys, "learn", "new", "-o", path).endswith(said)
 
 
 def test_samples_are_counts_osem_and_the_truth_at_their_level(recipe, tmp_path):
@@ -146,8 +133,8 @@ def test_samples_are_counts_osem_and_the_truth_at_their_level(recipe, tmp_path):
     numbers = source.events.split("train").numbers
     assert samples.draws == [(number, draw) for number in numbers for draw in (0, 1)]
     levels = []
-    for (number, draw), sample in zip(samples.draws, (samples[i] for i in range(len(samples))), strict=True):
-        event, level = source._by_number[number], (1.0, 0.5)[(number + draw) % 2]
+    for i, (number, draw) in enumerate(samples.draws):
+        sample, event, level = samples[i], source._by_number[number], (1.0, 0.5)[(number + draw) % 2]
         means = level * event.images("emission")
         assert abs(float(sample.counts.sum()) - means.sum()) < 6 * np.sqrt(means.sum())
         np.testing.assert_allclose(sample.background, 0.25 * level)  # counts that the recipe has in each pixel
@@ -157,21 +144,14 @@ def test_samples_are_counts_osem_and_the_truth_at_their_level(recipe, tmp_path):
         assert float(sample.osem[1].square().mean()) == pytest.approx(1, rel=1e-5)
         levels.append(level)
     assert {*levels} == {0.5, 1.0}
-    own = samples.draws.index((numbers[0], 0))
-    event, level = source._by_number[numbers[0]], levels[own]
-    np.testing.assert_array_equal(samples[own].counts, event.images("emission", event.noise_seed, level))
-    assert not torch.equal(samples[own].counts, samples[own + 1].counts)
+    event = source._by_number[numbers[0]]  # whose first draw has the noise of its own seed
+    np.testing.assert_array_equal(samples[0].counts, event.images("emission", event.noise_seed, levels[0]))
+    assert not torch.equal(samples[0].counts, samples[1].counts)
 
 
 def test_samples_are_made_once_and_go_on_where_they_were_stopped(recipe, tmp_path, monkeypatch):
-    made = []
-
-    def watched(self, draw):
-        made.append(draw)
-        return sample(self, draw)
-
-    sample = Source.sample
-    monkeypatch.setattr(Source, "sample", watched)
+    draws, sample = [], Source.sample
+    monkeypatch.setattr(Source, "sample", lambda self, draw: draws.append(draw) or sample(self, draw))
 
     def stop(done: int, total: int) -> None:
         if done == 3:
@@ -179,34 +159,27 @@ def test_samples_are_made_once_and_go_on_where_they_were_stopped(recipe, tmp_pat
 
     with pytest.raises(mph.Cancelled):
         prepare_samples(Source(recipe), tmp_path, ["train"], progress=stop)
-    first = len(made)
+    first = len(draws)
     (samples,) = prepare_samples(Source(recipe), tmp_path, ["train"])
-    assert first < len(samples) and sorted(made) == samples.draws
+    assert first < len(samples) and sorted(draws) == samples.draws
     (again,) = prepare_samples(Source(recipe), tmp_path, ["train"])
     (other,) = prepare_samples(Source(changed(recipe, "after = [1, 2]", "after = [1, 3]")), tmp_path, ["train"])
     assert again.folder == samples.folder != other.folder
-    assert len(made) == 2 * len(samples)
+    assert len(draws) == 2 * len(samples)
     assert not list(samples.folder.glob(".*"))
 
 
-def test_samples_that_do_not_fit_onto_the_disk_are_refused_before_any_is_made(recipe, tmp_path, monkeypatch):
-    usage = data.shutil.disk_usage(tmp_path)
-    monkeypatch.setattr(data.shutil, "disk_usage", lambda _: usage._replace(free=10_000))
-    with pytest.raises(mph.InputError, match=r"the samples take .* KiB, 10 KiB are free"):
-        prepare_samples(Source(recipe), tmp_path, ["train"])
-
-
-@pytest.mark.parametrize(
-    ("before", "after", "words"),
-    [
+def test_events_that_cannot_be_learned_from_and_a_full_disk_are_refused(recipe, tmp_path, monkeypatch):
+    for before, after, words in (
         ('events = "set"', 'events = "sets"', "sets"),
         ('train = "train"', 'train = "training"', "split 'training': there are "),
         ('events = "set"', 'events = "set"\nmodel = "lines"', "data.model: expected one of the set's models of counts"),
-    ],
-)  # fmt: skip
-def test_events_that_cannot_be_learned_from_are_refused(recipe, tmp_path, before, after, words):
-    with pytest.raises(mph.InputError, match=words):
-        mph.learning.train(changed(recipe, before, after), tmp_path / "m.pt")
+    ):
+        wrong = changed(recipe, before, after)
+        refused(lambda wrong=wrong: mph.learning.train(wrong, tmp_path / "m.pt"), words)
+    usage = data.shutil.disk_usage(tmp_path)
+    monkeypatch.setattr(data.shutil, "disk_usage", lambda _: usage._replace(free=10_000))
+    refused(lambda: prepare_samples(Source(recipe), tmp_path, ["train"]), "the samples take ", " KiB, 10 KiB are free")
 
 
 def test_truth_from_coarse_voxels_is_doubted(recipe, tmp_path):
@@ -228,11 +201,10 @@ def test_the_loss_is_the_nrmse_and_a_share_of_those_on_the_way():
 
 @pytest.mark.long
 def test_a_stopped_and_resumed_training_gives_the_same_weights_bit_for_bit(recipe, tmp_path):
-    recipe, told = changed(recipe, "steps = 6", "steps = 60"), []  # three steps a round, a mean of more than one
-    whole = mph.learning.train(
-        recipe, tmp_path / "whole.pt", stages=lambda words: lambda *done: told.append((words, done))
-    )
-    assert told[-1] == ("training", (60, 60))
+    recipe, steps = changed(recipe, "steps = 6", "steps = 60"), []  # three steps a round, a mean of more than one
+    stages = lambda words: lambda *done: steps.append((words, done))  # noqa: E731
+    whole = mph.learning.train(recipe, tmp_path / "whole.pt", stages=stages)
+    assert steps[-1] == ("training", (60, 60))
 
     def stop_at(step: int):
         def progress(done: int, total: int) -> None:
@@ -247,30 +219,28 @@ def test_a_stopped_and_resumed_training_gives_the_same_weights_bit_for_bit(recip
             mph.learning.train(recipe, path, stages=stop_at(step))
         assert not path.exists()
     parts = mph.learning.train(recipe, path)
-    assert same(whole, parts)
-    assert same(whole, mph.learning.train(recipe, path))  # there is nothing left to do
-    no_time = [{**row, "seconds": 0} for row in whole.contents.curve]
-    assert no_time == [{**row, "seconds": 0} for row in parts.contents.curve]
-    assert [row["step"] for row in no_time] == list(range(3, 61, 3))
-    assert [row["events"] for row in no_time] == list(range(6, 121, 6))
+    assert same_weights(whole, parts)
+    assert same_weights(whole, mph.learning.train(recipe, path))  # there is nothing left to do
+    curve, same = ([{**row, "seconds": 0} for row in network.contents.curve] for network in (whole, parts))
+    assert curve == same
+    assert [(row["step"], row["events"]) for row in curve] == [(n, 2 * n) for n in range(3, 61, 3)]
     assert json.loads((tmp_path / "parts-training" / "curve.json").read_text(encoding="utf-8")) == parts.contents.curve
-    assert no_time[-1]["train"] < no_time[0]["train"]
-    assert not same(
-        whole, mph.learning.train(changed(recipe, "batch = 2", "batch = 2\nseed = 1"), tmp_path / "seed.pt")
-    )
+    assert curve[-1]["train"] < curve[0]["train"]
+    other = changed(recipe, "batch = 2", "batch = 2\nseed = 1")
+    assert not same_weights(whole, mph.learning.train(other, tmp_path / "seed.pt"))
 
 
 @pytest.mark.long
 def test_a_folder_of_another_training_is_not_gone_on_with(recipe, tmp_path):
+    path, other = tmp_path / "m.pt", changed(recipe, "batch = 2", "batch = 1")
+    unusable = changed(recipe, "batch = 2", 'batch = 2\nstrategy = "words"')
     with pytest.raises(mph.InputError, match="Lightning refuses"):
-        mph.learning.train(changed(recipe, "batch = 2", 'batch = 2\nstrategy = "words"'), tmp_path / "m.pt")
-    mph.learning.train(recipe, tmp_path / "m.pt")  # nothing was trained there by the other
-    other = changed(recipe, "batch = 2", "batch = 1")
-    with pytest.raises(mph.InputError, match=r"plan\.json: of a training by another recipe: remove its folder"):
-        mph.learning.train(other, tmp_path / "m.pt")
+        mph.learning.train(unusable, path)
+    mph.learning.train(recipe, path)  # nothing was trained there by the other
+    words = "plan.json: of a training by another recipe: remove its folder"
+    refused(lambda: mph.learning.train(other, path), words)
     (tmp_path / "m-training" / "last.ckpt").write_bytes(b"half a chec")
-    with pytest.raises(mph.InputError, match=r"last\.ckpt: .*remove it to begin anew"):
-        mph.learning.train(recipe, tmp_path / "m.pt")
+    refused(lambda: mph.learning.train(recipe, path), "last.ckpt: ", "remove it to begin anew")
 
 
 @pytest.mark.long
@@ -278,14 +248,13 @@ def test_a_warm_start_takes_the_weights_of_equal_names_and_shapes(recipe, tmp_pa
     first = mph.learning.train(recipe, tmp_path / "first.pt")
     slow = 'kind = "toy"\nweights_from = "first.pt"'
     recipe = changed(changed(recipe, 'kind = "toy"', slow), "batch = 2", "batch = 2\nrate = 1e-9")
-    begun = mph.learning.train(recipe, tmp_path / "begun.pt")
-    for name, values in first.contents.weights.items():
-        torch.testing.assert_close(begun.contents.weights[name], values, rtol=0, atol=1e-6)
     wider = changed(recipe, 'weights_from = "first.pt"', 'weights_from = "first.pt"\nchannels = 5')
-    begun = mph.learning.train(wider, tmp_path / "wider.pt")  # the last bias alone is of the same shape
-    torch.testing.assert_close(
-        begun.contents.weights["last.bias"], first.contents.weights["last.bias"], rtol=0, atol=1e-6
-    )
+    # Of a wider network the last bias alone is of the same shape.
+    for second, names in ((recipe, [*first.contents.weights]), (wider, ["last.bias"])):
+        begun = mph.learning.train(second, tmp_path / f"{len(names)}.pt")
+        for name in names:
+            expected = first.contents.weights[name]
+            torch.testing.assert_close(begun.contents.weights[name], expected, rtol=0, atol=1e-6)
 
 
 SCRIPT = """
@@ -299,40 +268,33 @@ if __name__ == "__main__":
 """
 
 
-def script(folder: Path) -> list[str]:
-    """The command line with the toy, as a program that Lightning can start once more."""
-    (folder / "command.py").write_text(textwrap.dedent(SCRIPT), encoding="utf-8")
-    return [sys.executable, str(folder / "command.py"), "learn", "train"]
-
-
-def environment() -> dict[str, str]:
-    return {**os.environ, "PYTHONPATH": str(Path(mphdrr.__path__[0]).parent)}
+def start_training(folder: Path, *changes: str) -> subprocess.Popen:
+    """Start a training of the toy, with one text of its recipe changed, as a program that Lightning can start again."""
+    (folder / "command.py").write_text(SCRIPT, encoding="utf-8")
+    (folder / "changed.toml").write_text(TRAINING.replace(*changes), encoding="utf-8")
+    words = ["command.py", "learn", "train", str(folder / "changed.toml"), "-o", str(folder / "m.pt")]
+    environment = {**os.environ, "PYTHONPATH": str(Path(mphdrr.__path__[0]).parent)}
+    return subprocess.Popen([sys.executable, *words], cwd=folder, env=environment, stderr=subprocess.PIPE, text=True)
 
 
 @pytest.mark.long  # each process imports torch
 def test_two_processes_have_the_loss_of_one_with_the_same_batch(recipe, tmp_path):
     one = mph.learning.train(recipe, tmp_path / "one.pt")
-    both = 'batch = 2\ndevices = 2\nstrategy = "ddp"'
-    (tmp_path / "two.toml").write_text(TRAINING.replace("batch = 2", both), encoding="utf-8")
-    done = subprocess.run(
-        [*script(tmp_path), str(tmp_path / "two.toml"), "-o", str(tmp_path / "two.pt")],
-        cwd=tmp_path, env=environment(), capture_output=True, text=True, timeout=300,
-    )  # fmt: skip
-    assert done.returncode == 0, done.stderr
-    two = mph.learning.read_model(tmp_path / "two.pt")
+    running = start_training(tmp_path, "batch = 2", 'batch = 2\ndevices = 2\nstrategy = "ddp"')
+    said = running.communicate(timeout=300)[1]
+    assert running.returncode == 0, said
+    two = mph.learning.read_model(tmp_path / "m.pt")
     for ours, theirs in zip(one.contents.curve, two.contents.curve, strict=True):
-        assert ours["train"] == pytest.approx(theirs["train"], abs=1e-4)
-        assert ours["validation"] == pytest.approx(theirs["validation"], abs=1e-4)
+        for loss in ("train", "validation"):
+            assert ours[loss] == pytest.approx(theirs[loss], abs=1e-4)
 
 
 @pytest.mark.long  # each process imports torch
 @pytest.mark.skipif(os.name == "nt", reason="Windows has no SIGINT for one process")
 def test_ctrl_c_keeps_a_checkpoint_and_the_same_command_goes_on(recipe, tmp_path):
-    (tmp_path / "long.toml").write_text(TRAINING.replace("steps = 6", "steps = 4000"), encoding="utf-8")
-    command = [*script(tmp_path), str(tmp_path / "long.toml"), "-o", str(tmp_path / "m.pt")]
     last, before = tmp_path / "m-training" / "last.ckpt", 0
     for _ in range(2):
-        running = subprocess.Popen(command, cwd=tmp_path, env=environment(), stderr=subprocess.PIPE, text=True)
+        running = start_training(tmp_path, "steps = 6", "steps = 4000")
         for _ in range(1200):
             if (last.exists() and last.stat().st_mtime_ns > before) or running.poll() is not None:
                 break

@@ -1,5 +1,6 @@
 """SIRT, CGLS and TV: falling objectives, known solutions, resuming, and what they are given."""
 
+import functools
 import re
 import warnings
 
@@ -9,6 +10,8 @@ from scipy.ndimage import gaussian_filter
 
 import mphdrr.core as mph
 from mphdrr.core.reconstruction.tv import _gradient, _gradient_adjoint, total_variation
+
+from .conftest import refused
 
 GRID = mph.Grid.centered((7, 6, 5), (2.0, 2.0, 3.0))
 VIEWS = mph.parallel_views(np.arange(12) * np.pi / 12, (10, 14), 1.5, elevation=np.tile([0.0, 0.5], 6))
@@ -27,11 +30,7 @@ def matrix():
     return np.stack([A(x).ravel() for x in unit], axis=1).astype(float)
 
 
-ALGORITHMS = {
-    "sirt": lambda *a, **k: mph.sirt(*a, **k),
-    "cgls": lambda *a, **k: mph.cgls(*a, **k),
-    "tv": lambda A, y, *a, **k: mph.tv(A, y, 0.5, *a, **k),
-}
+ALGORITHMS = {"sirt": mph.sirt, "cgls": mph.cgls, "tv": functools.partial(mph.tv, weight=0.5)}
 
 
 @pytest.mark.parametrize("nonnegative", [True, False])
@@ -199,18 +198,6 @@ def test_tv_is_nearer_to_the_truth_than_least_squares_with_few_noisy_views():
 
 
 @pytest.mark.parametrize("name", ALGORITHMS)
-def test_a_resumed_one_gives_the_same_numbers(name, tmp_path):
-    run = ALGORITHMS[name]
-    whole = run(A, NOISY, iterations=9)
-    first = run(A, NOISY, iterations=4)
-    mph.write_reconstruction(first, tmp_path / "first.h5")
-    for half in (first, mph.read_reconstruction(tmp_path / "first.h5")):
-        resumed = run(A, NOISY, iterations=5, start=half)
-        np.testing.assert_array_equal(resumed.volume.array, whole.volume.array)
-        np.testing.assert_array_equal(resumed.objective, whole.objective)
-
-
-@pytest.mark.parametrize("name", ALGORITHMS)
 def test_other_images_views_or_masks_cannot_go_on_with_what_is_known_of_the_first(name):
     run = ALGORITHMS[name]
     half = run(A, NOISY, iterations=2)
@@ -221,10 +208,9 @@ def test_other_images_views_or_masks_cannot_go_on_with_what_is_known_of_the_firs
     for other, images, more in (
         (A, NOISY + 1, {}), (fewer, NOISY[1:], {}), (A, NOISY, {"mask": mask}), (turned, NOISY[::-1], {})
     ):  # fmt: skip
-        with pytest.raises(mph.InputError, match="start: this reconstruction is of other images, views or mask"):
-            run(other, images, iterations=1, start=half, **more)
-        begun = run(other, images, iterations=1, start=half.volume, **more)
-        assert begun.iterations == 1
+        call = functools.partial(run, other, images, iterations=1, **more)
+        refused(lambda call=call: call(start=half), "start: this reconstruction is of other images, views or mask")
+        assert call(start=half.volume).iterations == 1
     assert run(A, NOISY, iterations=1, start=half).iterations == 3
 
 
@@ -234,51 +220,25 @@ def test_other_arguments_cannot_go_on_with_what_is_known_of_the_first(scanner):
     B, other_model = (
         mph.Projector(grid, system.views((5, 5)), m) for m in (mph.Transmission(), mph.InverseSquareSum(system))
     )
-    for half, other, said in (
-        (mph.sirt(A, NOISY, 2), lambda half: mph.sirt(A, NOISY, 1, 1.5, start=half), "relaxation 1.0, now 1.5"),
-        (
-            mph.sirt(A, NOISY, 2),
-            lambda half: mph.sirt(A, NOISY, 1, 1.0, False, start=half),
-            "nonnegative True, now False",
-        ),
-        (mph.tv(A, NOISY, 0.5, 2), lambda half: mph.tv(A, NOISY, 0.7, 1, start=half), "weight 0.5, now 0.7"),
-        (mph.sirt(A, NOISY, 2), lambda half: mph.sirt(other_views, NOISY, 1, start=half), "views "),
-        (mph.cgls(A, NOISY, 2), lambda half: mph.cgls(other_views, NOISY, 1, start=half), "views "),
-        (
-            mph.tv(B, blank, 0.5, 2),
-            lambda half: mph.tv(other_model, blank, 0.5, 1, start=half),
-            "model transmission, now",
-        ),
+    for method, first, other, said in (
+        (mph.sirt, (A, NOISY, 2), (A, NOISY, 1, 1.5), "relaxation 1.0, now 1.5"),
+        (mph.sirt, (A, NOISY, 2), (A, NOISY, 1, 1.0, False), "nonnegative True, now False"),
+        (mph.tv, (A, NOISY, 0.5, 2), (A, NOISY, 0.7, 1), "weight 0.5, now 0.7"),
+        (mph.sirt, (A, NOISY, 2), (other_views, NOISY, 1), "views "),
+        (mph.cgls, (A, NOISY, 2), (other_views, NOISY, 1), "views "),
+        (mph.tv, (B, blank, 0.5, 2), (other_model, blank, 0.5, 1), "model transmission, now"),
     ):
-        with pytest.raises(mph.InputError, match=f"start: .*{re.escape(said)}.*give its volume"):
-            other(half)
+        call = functools.partial(method, *other, start=method(*first))
+        refused(call, f"start: .*{re.escape(said)}.*give its volume")
 
 
 @pytest.mark.parametrize("name", ALGORITHMS)
-def test_masks_starts_callbacks_stops_and_progress(name):
-    run = ALGORITHMS[name]
-    mask = TRUTH > 0
-    seen, steps = [], []
-
-    def watch(iteration, values):
-        seen.append((iteration, values.copy()))
-        return iteration == 3
-
-    result = run(A, IMAGES, iterations=10, mask=mask, callback=watch, progress=lambda *done: steps.append(done))
-    assert [iteration for iteration, _ in seen] == [1, 2, 3] and result.iterations == 3
-    assert not result.volume.array[~mask].any() and result.volume.array[mask].any()
-    assert steps[-1][0] < steps[-1][1] and [done for done, _ in steps] == sorted(done for done, _ in steps)
-    started = run(A, IMAGES, iterations=2, start=mph.Volume(TRUTH, GRID, "activity"))
+def test_the_truth_is_a_start_that_is_kept_and_little_change_ends_it(name):
+    started = ALGORITHMS[name](A, IMAGES, iterations=2, start=mph.Volume(TRUTH, GRID, "activity"))
     np.testing.assert_allclose(started.volume.array, TRUTH, atol=0.15 if name == "tv" else 1e-3)
     assert started.volume.quantity == "activity"
-    stopped = run(A, NOISY, iterations=500, stop=mph.StopWhen(change=1e-3))
+    stopped = ALGORITHMS[name](A, NOISY, iterations=500, stop=mph.StopWhen(change=1e-3))
     assert stopped.iterations < 500 and stopped.settings["stopped"] == "change"
-
-    def cancel(done, total):
-        raise mph.Cancelled
-
-    with pytest.raises(mph.Cancelled):
-        run(A, IMAGES, iterations=2, progress=cancel)
 
 
 @pytest.mark.long
@@ -298,32 +258,12 @@ def test_counts_of_pinholes_lose_their_background(name):
     assert np.abs(B(result.volume.array) + 50.0 - counts).mean() < 0.4 * B(truth).mean()
 
 
-@pytest.mark.parametrize("name", ALGORITHMS)
-def test_wrong_input_is_named(name):
-    run = ALGORITHMS[name]
-    broken = IMAGES.copy()
-    broken[0, 1, 2] = np.nan
-    for arguments, options, words in (
-        ((A, IMAGES[:3]), {}, "images: expected shape 12 x 10 x 14"),
-        ((A, broken), {}, r"images: nan is not a finite number at index \(0, 1, 2\)"),
-        (("A", IMAGES), {}, "expected a Projector, got str"),
-        ((A, IMAGES), {"iterations": 0}, "iterations: expected a whole number"),
-        ((A, IMAGES), {"start": np.ones((2, 2, 2))}, "start: expected shape"),
-        ((A, IMAGES), {"mask": np.ones(GRID.shape)}, "mask: expected booleans"),
-    ):
-        with pytest.raises(mph.InputError, match=words):
-            run(*arguments, **options)
-
-
 def test_wrong_numbers_are_named():
     for relaxation in (0, 2, np.nan):
-        with pytest.raises(mph.InputError, match="relaxation"):
-            mph.sirt(A, IMAGES, relaxation=relaxation)
+        refused(lambda relaxation=relaxation: mph.sirt(A, IMAGES, relaxation=relaxation), "relaxation")
     for weight in (0, -1, np.inf):
-        with pytest.raises(mph.InputError, match="weight"):
-            mph.tv(A, IMAGES, weight)
-    with pytest.raises(mph.InputError, match="nonnegative: expected a bool"):
-        mph.sirt(A, IMAGES, nonnegative="yes")
-    with pytest.raises(mph.InputError, match="start: expected 0 or more"):
-        mph.sirt(A, IMAGES, start=-TRUTH)
+        refused(lambda weight=weight: mph.tv(A, IMAGES, weight), "weight")
+    refused(lambda: mph.sirt(A, IMAGES, nonnegative="yes"), "nonnegative: expected a bool")
+    for name in ("sirt", "tv"):
+        refused(lambda name=name: ALGORITHMS[name](A, IMAGES, start=-TRUTH), "start: expected 0 or more")
     assert mph.cgls(A, IMAGES, 1, start=-TRUTH).volume.array.min() < 0

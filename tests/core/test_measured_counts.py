@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+
 import h5py
 import numpy as np
 import pytest
@@ -9,10 +11,11 @@ import pytest
 import mphdrr.core as mph
 from mphdrr.addon.cli import main
 from mphdrr.core.runs.comparing import difference
-from mphdrr.core.runs.mosaic import caption, labels
+from mphdrr.core.runs.mosaic import counts_caption, module_labels
 from mphdrr.core.runs.recipe import recorded_recipe
 
 from . import dicom_files
+from .conftest import refused
 
 SPHERE = "[[shape]]\nkind = 'sphere'\nradius = 30\nactivity = 5\nmu = 0.015\n"
 SMALL = {
@@ -48,8 +51,7 @@ def test_the_projector_of_a_run_makes_its_images(system, entries):
 
 def test_a_run_without_a_recipe_says_so(system, simulated):
     run = mph.project_run(system, simulated.volume, (4, 4), "real")
-    with pytest.raises(mph.InputError, match="holds no recipe"):
-        mph.projector_of_run(run, run.volume.grid)
+    refused(lambda: mph.projector_of_run(run, run.volume.grid), "holds no recipe")
 
 
 @pytest.fixture
@@ -248,9 +250,7 @@ GOOD = {"frames": "101-112", "orientation": "back-v", "time": 3.0}
     ],
 )
 def test_what_is_not_said_or_said_wrongly_is_one_clear_line(system, changes, said):
-    with pytest.raises(mph.InputError, match=said) as error:
-        mph.counts_run(np.ones((12, 5, 6), int), system, **{**GOOD, **changes})
-    assert "\n" not in str(error.value)
+    refused(lambda: mph.counts_run(np.ones((12, 5, 6), int), system, **{**GOOD, **changes}), said)
 
 
 @pytest.mark.parametrize(
@@ -266,13 +266,11 @@ def test_what_is_not_said_or_said_wrongly_is_one_clear_line(system, changes, sai
 def test_what_is_no_count_is_named_with_its_place(system, value, said):
     counts = np.ones((12, 5, 6))
     counts[3, 1, 5] = value
-    with pytest.raises(mph.InputError, match=said):
-        mph.counts_run(counts, system, **GOOD)
+    refused(lambda: mph.counts_run(counts, system, **GOOD), said)
     if value == 2.5:
         assert mph.counts_run(counts, system, **GOOD, expected=True).projections[3, 1, 5] == 2.5
     for wrong in (counts[0], counts.astype(complex), counts.astype(str), counts[:0]):
-        with pytest.raises(mph.InputError, match=r"expected (real )?numbers"):
-            mph.counts_run(wrong, system, **GOOD)
+        refused(lambda wrong=wrong: mph.counts_run(wrong, system, **GOOD), r"expected (real )?numbers")
 
 
 def test_modules_without_a_frame_are_named(system):
@@ -286,51 +284,46 @@ def test_frames_that_are_not_used_are_left_out(system):
     for frames in ("none,102,NONE * 2 101", [None, 102, None, None, np.int64(101)]):
         run = mph.counts_run(counts, system[:2], frames, "back-v", 3)
         np.testing.assert_array_equal(run.projections, counts[[4, 1]])
-        assert labels(run) == ["101 (5)", "102 (2)"]
-    with pytest.raises(mph.InputError, match="say none for a frame that is not used"):
-        mph.counts_run(counts, system[:2], "101-102", "back-v", 3)
+        assert module_labels(run) == ["101 (5)", "102 (2)"]
+    refused(lambda: mph.counts_run(counts, system[:2], "101-102", "back-v", 3), "say none for a frame that is not used")
 
 
 def test_files_that_hold_no_frames_are_refused_in_one_line(tmp_path):
     frames = np.arange(24, dtype=np.uint16).reshape(2, 3, 4)
-
-    def refused(said, path, **options):
-        with pytest.raises(mph.InputError, match=said) as error:
-            mph.read_counts(path, **options)
-        assert "\n" not in str(error.value) and tmp_path.name in str(error.value)
-
-    path = tmp_path / "counts.raw"
-    frames.tofile(path)
-    refused("of raw numbers say the shape", path)
-    refused("need their type", path, shape=(2, 3, 4))
-    refused("need their shape", path, type="uint16")
-    refused("expected one of uint8", path, shape=(2, 3, 4), type="u2")
-    refused(
-        r"expected 96 bytes \(2 x 3 x 4 numbers of 4 bytes\), counts.raw has 48", path, shape=(2, 3, 4), type="int32"
-    )
-    refused("no such file", tmp_path / "none.npy")
-    refused("is a folder", tmp_path)
-    (tmp_path / "text.npy").write_text("12 13")
-    refused("not a file of numpy", tmp_path / "text.npy")
-    np.save(tmp_path / "flat.npy", frames.ravel())
-    refused(r"expected \(frames, rows, columns\), got shape 24", tmp_path / "flat.npy")
-    np.save(tmp_path / "words.npy", frames.astype(str))
-    refused("expected whole or real numbers", tmp_path / "words.npy")
-    np.save(tmp_path / "good.npy", frames)
-    np.save(tmp_path / "other.npy", frames[:, :2])
-    refused("frames of 2 x 4 pixels, .*good.npy of 3 x 4", [tmp_path / "good.npy", tmp_path / "other.npy"])
-    refused("this file has no names", tmp_path / "good.npy", dataset="a")
+    arrays = {"flat": frames.ravel(), "words": frames.astype(str), "good": frames, "other": frames[:, :2]}
+    for name, array in arrays.items():
+        np.save(tmp_path / f"{name}.npy", array)
     np.savez(tmp_path / "two.npz", a=frames, b=frames)
-    refused(r"2 arrays of three axes in it; say which \(--dataset NAME\): a \(2 x 3 x 4\), b", tmp_path / "two.npz")
-    refused("no dataset 'c' in it; there are: a, b", tmp_path / "two.npz", dataset="c")
-    write_hdr(frames, tmp_path / "cut.hdr")
+    frames.tofile(tmp_path / "counts.raw")
+    (tmp_path / "text.npy").write_text("12 13")
+    for name in ("cut", "alone"):
+        write_hdr(frames, tmp_path / f"{name}.hdr")
     (tmp_path / "cut.sin").write_bytes(b"12345")
-    refused("expected 48 bytes .*, cut.sin has 5", tmp_path / "cut.hdr")
-    refused("expected its header cut.hdr, which is beside it", tmp_path / "cut.sin")
-    (tmp_path / "cut.sin").unlink()
-    refused("which is not beside it", tmp_path / "cut.hdr")
+    (tmp_path / "alone.sin").unlink()
     (tmp_path / "analyze.hdr").write_bytes(bytes(348))
-    refused("not an Interfile header", tmp_path / "analyze.hdr")
+    for names, options, said in (
+        ("counts.raw", {}, "of raw numbers say the shape"),
+        ("counts.raw", {"shape": (2, 3, 4)}, "need their type"),
+        ("counts.raw", {"type": "uint16"}, "need their shape"),
+        ("counts.raw", {"shape": (2, 3, 4), "type": "u2"}, "expected one of uint8"),
+        ("counts.raw", {"shape": (2, 3, 4), "type": "int32"}, "96 bytes (2 x 3 x 4 numbers of 4 bytes), counts.raw has 48"),
+        ("none.npy", {}, "no such file"),
+        ("", {}, "is a folder"),
+        ("text.npy", {}, "not a file of numpy"),
+        ("flat.npy", {}, "expected (frames, rows, columns), got shape 24"),
+        ("words.npy", {}, "expected whole or real numbers"),
+        ("good.npy other.npy", {}, "frames of 2 x 4 pixels, .*good.npy of 3 x 4"),
+        ("good.npy", {"dataset": "a"}, "this file has no names"),
+        ("two.npz", {}, "2 arrays of three axes in it; say which (--dataset NAME): a (2 x 3 x 4), b"),
+        ("two.npz", {"dataset": "c"}, "no dataset 'c' in it; there are: a, b"),
+        ("cut.hdr", {}, "expected 48 bytes .*, cut.sin has 5"),
+        ("cut.sin", {}, "expected its header cut.hdr, which is beside it"),
+        ("alone.hdr", {}, "which is not beside it"),
+        ("analyze.hdr", {}, "not an Interfile header"),
+    ):  # fmt: skip
+        paths = [tmp_path / name for name in names.split()] or tmp_path
+        call = functools.partial(mph.read_counts, paths[0] if len(names.split()) == 1 else paths, **options)
+        refused(call, said, tmp_path.name)
 
 
 def test_dicom_says_its_time_and_what_else_it_holds(system, tmp_path):
@@ -347,11 +340,9 @@ def test_dicom_says_its_time_and_what_else_it_holds(system, tmp_path):
     texts = [str(one.message) for one in caught]
     assert any("pixels of 3 x 3 mm; taken as" in text for text in texts)
     dicom_files.write_frames(frames, path, ImageType=["ORIGINAL", "PRIMARY", "RECON TOMO", "EMISSION"])
-    with pytest.raises(mph.InputError, match="reconstructed tomogram; expected a frame a module"):
-        mph.read_counts(path)
+    refused(lambda: mph.read_counts(path), "reconstructed tomogram; expected a frame a module")
     dicom_files.write_frames(frames, path, Modality="CT")
-    with pytest.raises(mph.InputError, match="modality CT: expected nuclear medicine"):
-        mph.read_counts(path)
+    refused(lambda: mph.read_counts(path), "modality CT: expected nuclear medicine")
 
 
 def test_the_command_takes_counts_for_projections(workbook, tmp_path, capsys):
@@ -367,8 +358,8 @@ def test_the_command_takes_counts_for_projections(workbook, tmp_path, capsys):
         workbook.name,
         [4, 3, 2, 1],
     )
-    assert labels(made) == ["1 (4)", "2 (3)", "3 (2)", "4 (1)"]
-    assert caption(made).startswith("c.npy, 60 s, frames back-v. Module (frame): crystals seen from behind")
+    assert module_labels(made) == ["1 (4)", "2 (3)", "3 (2)", "4 (1)"]
+    assert counts_caption(made).startswith("c.npy, 60 s, frames back-v. Module (frame): crystals seen from behind")
     assert main([*command, *told, "--write-recipe", str(tmp_path / "c.toml")]) == 0
     assert main(["project", str(tmp_path / "c.toml"), "-o", str(tmp_path / "again.npz")]) == 0
     np.testing.assert_array_equal(mph.read_run(tmp_path / "again.npz").projections, made.projections)
@@ -394,8 +385,7 @@ def test_a_measured_run_goes_where_runs_go(system, measured, tmp_path):
     run = mph.counts_run(frames, system, system.numbers, "back-v", 600.0)
     assert difference(run, measured).maximum == 0
     mph.write_run(run, tmp_path / "run.h5")
-    with pytest.raises(mph.InputError, match="without a volume"):
-        mph.ProjectionRun(run.projections, system, run.views)
+    refused(lambda: mph.ProjectionRun(run.projections, system, run.views), "without a volume")
     assert main(["project", str(tmp_path / "run.h5"), "-o", str(tmp_path / "b.h5")]) == 1  # of an array, not of a file
     assert main(["figure", "mosaic", str(tmp_path / "run.h5"), "-o", str(tmp_path / "m.png")]) == 0
     assert main(["figure", "sums", str(tmp_path / "run.h5"), "-o", str(tmp_path / "s.png")]) == 1

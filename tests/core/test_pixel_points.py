@@ -11,8 +11,8 @@ import mphdrr.core as mph
 from mphdrr.core.errors import InputWarning
 from mphdrr.core.models.pixel_points import expected_error, lattice, offsets, points_needed, shadow_edges
 
-from .conftest import WORKBOOK, general_grid, refused
-from .test_emission import BACKENDS, assert_adjoint, assert_real_is_virtual, in_ball, one_module, turned_grid
+from .conftest import WORKBOOK, refused
+from .test_emission import in_ball, one_module, turned_grid
 
 MODULES = mph.read_system(WORKBOOK)[[3, 10, 21, 38, 62]]  # of all rings; two look nearly along an axis
 
@@ -28,32 +28,26 @@ def law(system, grid):
     return np.einsum("vsm,s->m", counts, share) * grid.voxel_volume
 
 
-def totals(grid, n, backend="auto", **options):
+def totals(grid, n, **options):
     hole = "rays" if "aperture_points" in options else "point"
-    A = mph.Projector(grid, MODULES.views((n, n), "real"), mph.Emission(MODULES, hole=hole, **options), backend)
+    A = mph.Projector(grid, MODULES.views((n, n), "real"), mph.Emission(MODULES, hole=hole, **options))
     return A(np.ones(grid.shape)).sum(axis=(1, 2), dtype=float)
 
 
-@pytest.mark.parametrize(("n", "size"), [(64, 0.5), (64, 4.0), (128, 1.0), (512, 0.5)])
-def test_a_voxel_anywhere_counts_by_the_point_law(n, size, rng):
-    """Through the ideal pinhole; parallel and rotated voxels, from a fraction of a pixel to several pixels."""
-    places = in_ball(rng, 35, 3 if size < 1 and n == 64 else 6)
-    for grid in [mph.Grid.centered(1, size, place) for place in places[1:]] + [turned_grid((1, 1, 1), size, places[0])]:
-        np.testing.assert_allclose(totals(grid, n), law(MODULES, grid), rtol=0.02)
+POINTS = {"aperture_points": 7}
 
 
-@pytest.mark.parametrize(("n", "size"), [(64, 1.0), (128, 0.5), (256, 1.0)])
-def test_a_voxel_counts_the_same_through_points_of_the_hole(n, size, rng):
-    for place in in_ball(rng, 35, 3):
-        grid = mph.Grid.centered(1, size, place)
-        np.testing.assert_allclose(totals(grid, n, aperture_points=7), law(MODULES, grid), rtol=0.02)
-
-
-@pytest.mark.parametrize(("shape", "points"), [((1, 1, 60), 7), ((60, 1, 1), 1), ((1, 40, 40), 1)])
-def test_capillaries_and_sheets_of_one_voxel_count_by_the_point_law(shape, points, rng):
-    for place in in_ball(rng, 10, 2):
-        grid = mph.Grid.centered(shape, 1.0, place)
-        np.testing.assert_allclose(totals(grid, 64, aperture_points=points), law(MODULES, grid), rtol=0.02)
+@pytest.mark.parametrize(("n", "shape", "size", "hole"), [
+    (64, 1, 0.5, {}), (64, 1, 4.0, {}), (128, 1, 1.0, {}), (512, 1, 0.5, {}), (64, 1, 1.0, POINTS), (128, 1, 0.5, POINTS),
+    (256, 1, 1.0, POINTS), (64, (1, 1, 60), 1.0, POINTS), (64, (60, 1, 1), 1.0, {}), (64, (1, 40, 40), 1.0, {}),
+])  # fmt: skip
+def test_voxels_capillaries_and_sheets_anywhere_count_by_the_point_law(n, shape, size, hole, rng):
+    """Parallel and rotated voxels, from a fraction of a pixel to several pixels, through a point or points of the hole."""
+    places = in_ball(rng, 35 if shape == 1 else 10, 3 if size < 1 or shape != 1 else 6)
+    for grid in [mph.Grid.centered(shape, size, place) for place in places[1:]] + [
+        turned_grid((1, 1, 1), size, places[0])
+    ]:
+        np.testing.assert_allclose(totals(grid, n, **hole), law(MODULES, grid), rtol=0.02)
 
 
 def test_a_voxel_of_a_large_grid_counts_by_the_point_law(rng):
@@ -123,35 +117,6 @@ def test_lattices_fill_pixels_evenly(n):
         np.testing.assert_allclose(np.sort(side), (np.arange(n) + 0.5) / n - 0.5, atol=1e-12)
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
-def test_adjoint_with_points_of_pixels_and_hole(backend, system, rng):
-    grid = general_grid(rng, (9, 8, 7))
-    body = turned_grid((6, 5, 7), 25.0)
-    mu = mph.Volume(rng.uniform(0, 0.05, body.shape), body, "mu")
-    for options in (
-        {"pixel_points": 5},
-        {"pixel_points": 3, "aperture_points": 4, "crystal_mu": 0.1, "depth_layers": 2},
-    ):
-        model = mph.Emission(system[3:6], mu, tolerance=1e9, within_crystal=True, within_walls=True, **options)
-        assert_adjoint(mph.Projector(grid, system[3:6].views((5, 6)), model, backend, threads=2), rng)
-    assert_adjoint(mph.Projector(grid, system[3:6].views((5, 6)), mph.Transmission(5), backend), rng)
-
-
-@pytest.mark.parametrize("backend", BACKENDS[1:])
-def test_backends_agree_on_points_of_pixels(backend, system, rng):
-    grid = general_grid(rng, (9, 8, 7))
-    system = system[::4]
-    x, views = rng.random(grid.shape), system.views((9, 11))
-    for model in (mph.Emission(system, pixel_points=5, aperture_points=3, tolerance=1e9), mph.Transmission(8)):
-        reference, y = (mph.Projector(grid, views, model, name)(x) for name in ("numpy", backend))
-        assert reference.any()
-        np.testing.assert_allclose(y, reference, rtol=2e-5, atol=2e-5 * reference.max())
-
-
-def test_real_and_virtual_detectors_take_the_same_points(system, rng):
-    assert_real_is_virtual(mph.Emission(system, pixel_points=5, aperture_points=3, tolerance=1e9), rng)
-
-
 def test_points_of_a_pixel_are_those_of_finer_pixels(rng):
     """An image through many points of each pixel is that of four times finer pixels through their middles, binned."""
     system = one_module()
@@ -167,22 +132,21 @@ def test_points_of_a_pixel_are_those_of_finer_pixels(rng):
 
 def test_only_pixels_that_can_see_the_volume_are_traced_and_none_is_missed(system, rng):
     """A few filled voxels in a large grid, and a grid around a pinhole: the same as in the reference without a window."""
-    grid = mph.Grid.centered(24, 8.0)
+    grid, around, views = (
+        mph.Grid.centered(24, 8.0),
+        mph.Grid.centered(6, 30.0, system.centers[0]),
+        system.views((20, 24)),
+    )
     x = np.zeros(grid.shape)
     x[3:5, 17:20, 11] = rng.random((2, 3))
-    views = system.views((20, 24))
+    for volume, modules in ((mph.Volume(x, grid), range(12)), (mph.Volume(np.ones(around.shape), around), [0])):
+        image = mph.Projector(volume.grid, views, mph.Transmission())(volume)
+        for m in modules:
+            expected = mph.trace_rays(volume, *views.rays(m), "numpy").reshape(views.shape)
+            np.testing.assert_allclose(image[m], expected, rtol=2e-5, atol=2e-5 * max(expected.max(), 1))
     for model in (mph.Transmission(), mph.Emission(system, pixel_points=3, tolerance=1e9)):
-        image = mph.Projector(grid, views, model)(x)
-        for m in range(len(system)):
-            sources, targets = views.rays(m)
-            if model.name == "transmission":
-                expected = mph.trace_rays(mph.Volume(x, grid), sources, targets, "numpy").reshape(views.shape)
-                np.testing.assert_allclose(image[m], expected, atol=2e-5 * max(expected.max(), 1))
-        assert image.any() and not mph.Projector(grid, views, model)(np.zeros(grid.shape)).any()
-    around = mph.Grid.centered(6, 30.0, system.centers[0])
-    ones = mph.Volume(np.ones(around.shape), around)
-    expected = mph.trace_rays(ones, *views.rays(0), "numpy").reshape(views.shape)
-    np.testing.assert_allclose(mph.Projector(around, views, mph.Transmission())(ones)[0], expected, rtol=2e-5)
+        A = mph.Projector(grid, views, model)
+        assert A(x).any() and not A(np.zeros(grid.shape)).any()
 
 
 def test_bad_numbers_of_points_are_refused(system):

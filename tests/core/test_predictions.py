@@ -1,6 +1,6 @@
 """Each camera predicts the others: one view's image and depths against the projector's images of the other views."""
 
-from __future__ import annotations
+import functools
 
 import numpy as np
 import pytest
@@ -23,15 +23,11 @@ def blobs(grid: mph.Grid = GRID) -> mph.Volume:
 def all_round(parallel: bool = False) -> mph.Views:
     """Three views of all of the blobs: from the front, odd ones from the sides, with other pixels."""
     u, v, k = mph.euler_pose(0.2, 1.1, -0.4)[:3, :3].T
-    size = 0.45 if parallel else 1.0
-    return mph.Views(
-        [[0, -200, 10], -150 * k, [170, 30, 20]],
-        [[0, 300, -15], 250 * k + 9 * u - 14 * v, [-200, -40, 0]],
-        size * np.array([[4.5, 0, 0], 4.1 * u + 0.5 * v + 0.3 * k, [0.4, 3.3, 0]]),
-        size * np.array([[0, 0, 4.0], -4.2 * v + 0.4 * u, [0, 0.3, -3.6]]),
-        (52, 49),
-        parallel,
-    )
+    size, sources = 0.45 if parallel else 1.0, [[0, -200, 10], -150 * k, [170, 30, 20]]
+    middles = [[0, 300, -15], 250 * k + 9 * u - 14 * v, [-200, -40, 0]]
+    u_steps = size * np.array([[4.5, 0, 0], 4.1 * u + 0.5 * v + 0.3 * k, [0.4, 3.3, 0]])
+    v_steps = size * np.array([[0, 0, 4.0], -4.2 * v + 0.4 * u, [0, 0.3, -3.6]])
+    return mph.Views(sources, middles, u_steps, v_steps, (52, 49), parallel)
 
 
 def grid_of(views: mph.Views, m: int, n_k: int = 48) -> mph.PerspectiveGrid:
@@ -62,8 +58,8 @@ def test_with_wrong_depths_other_images_are_not():
     g = grid_of(views, 0)
     density = mph.spread_along_rays(images[0], np.ones(g.shape), g)
     errors = mph.prediction_errors(images, *mph.predict_views(density, g, views))
-    own, *others = np.abs(errors).max(axis=(1, 2)) / images.max(axis=(1, 2))
-    assert own < 0.035 and min(others) > 0.3
+    first, *others = np.abs(errors).max(axis=(1, 2)) / images.max(axis=(1, 2))
+    assert first < 0.035 and min(others) > 0.3
 
 
 def test_what_is_shared_out_is_the_image_again(rng):
@@ -71,13 +67,12 @@ def test_what_is_shared_out_is_the_image_again(rng):
     g = mph.PerspectiveGrid(views, 1, 9, 80, 240)
     images, shares = rng.random((3, 23, 26)), rng.random((3, *g.shape))
     shares[0, 4, 7], images[0, 7, 4] = 0, 0
-    found = mph.spread_along_rays(images, shares, g)
-    assert found.dtype == np.float32
-    np.testing.assert_allclose(g.image(found), images, rtol=1e-5)
-    np.testing.assert_allclose(mph.spread_along_rays(images, 7 * shares, g), found, rtol=1e-5)
-    np.testing.assert_allclose(
-        found[1, 5, 6] * g.ray_lengths()[5, 6], images[1, 6, 5] * shares[1, 5, 6] / shares[1, 5, 6].sum(), rtol=1e-5
-    )
+    density = mph.spread_along_rays(images, shares, g)
+    assert density.dtype == np.float32
+    np.testing.assert_allclose(g.image(density), images, rtol=1e-5)
+    np.testing.assert_allclose(mph.spread_along_rays(images, 7 * shares, g), density, rtol=1e-5)
+    expected = images[1, 6, 5] * shares[1, 5, 6] / shares[1, 5, 6].sum()
+    np.testing.assert_allclose(density[1, 5, 6] * g.ray_lengths()[5, 6], expected, rtol=1e-5)
 
 
 def test_covered_are_the_pixels_whose_rays_meet_the_cells(rng):
@@ -86,8 +81,7 @@ def test_covered_are_the_pixels_whose_rays_meet_the_cells(rng):
     predicted, covered = mph.predict_views(np.ones(g.shape), g, views, 40)
     for m, (image, inside) in enumerate(zip(predicted, covered, strict=True)):
         starts, ends = views.rays(m)
-        along = np.linspace(0.001, 1.5, 1500)[:, None, None]
-        points = g.from_world(starts + along * (ends - starts))
+        points = g.from_world(starts + np.linspace(0.001, 1.5, 1500)[:, None, None] * (ends - starts))
         ahead = (points[..., 2] > 0) & (points[..., 2] <= g.edges[0]) & (points[..., 2] >= g.edges[-1])
         meets = (ahead & (points[..., :2] >= -0.5).all(-1) & (points[..., :2] <= [25.5, 22.5]).all(-1)).any(axis=0)
         assert (inside.ravel() == meets).mean() > 0.97
@@ -97,9 +91,10 @@ def test_covered_are_the_pixels_whose_rays_meet_the_cells(rng):
 
 def test_behind_a_source_nothing_is_predicted():
     views = mph.Views([[0, -100, 0], [0, 300, 0]], [[0, 50, 0], [0, 450, 0]], [[4, 0, 0]] * 2, [[0, 0, 5]] * 2, (6, 7))
-    g = mph.PerspectiveGrid(views, 0, 5, 80, 120)
-    predicted, covered = mph.predict_views(np.ones(g.shape), g, views)
+    g, steps = mph.PerspectiveGrid(views, 0, 5, 80, 120), []
+    predicted, covered = mph.predict_views(np.ones(g.shape), g, views, 3, progress=lambda *step: steps.append(step))
     assert covered[0].all() and not covered[1].any() and not predicted[1].any() and (predicted[0] > 0).all()
+    assert steps == [(1, 2), (2, 2)]
 
 
 def test_tensors_and_their_gradients(rng):
@@ -123,24 +118,11 @@ def test_tensors_and_their_gradients(rng):
 
 def test_gradcheck():
     torch = pytest.importorskip("torch")
-    views = mph.Views(
-        [[0, -50, 0], [40, 2, 3]], [[0, 50, 0], [-60, 0, 0]], [[4, 0, 0], [0, 6, 1]], [[0, 0, 5], [0, 1, -6]], (3, 2)
-    )
+    sources, middles = [[0, -50, 0], [40, 2, 3]], [[0, 50, 0], [-60, 0, 0]]
+    views = mph.Views(sources, middles, [[4, 0, 0], [0, 6, 1]], [[0, 0, 5], [0, 1, -6]], (3, 2))
     g = mph.PerspectiveGrid(views, 0, 3, 35, 65)
-    image, shares = torch.rand(3, 2, dtype=torch.float64) + 0.1, torch.rand(2, 3, 3, dtype=torch.float64) + 0.1
-
-    def errors(image, shares):
-        return mph.predict_views(mph.spread_along_rays(image, shares, g), g, views, 4)[0]
-
-    assert torch.autograd.gradcheck(errors, (image.requires_grad_(), shares.requires_grad_()))
-
-
-def test_it_says_how_far_it_is_and_can_be_stopped():
-    views = odd_views()
-    g = mph.PerspectiveGrid(views, 0, 4, 190, 230)
-    calls: list[tuple[int, int]] = []
-    mph.predict_views(np.ones(g.shape), g, views, 3, progress=lambda *now: calls.append(now))
-    assert calls == [(n, 4) for n in (1, 2, 3, 4)]
+    inputs = [torch.rand(shape, dtype=torch.float64).add(0.1).requires_grad_() for shape in ((3, 2), (2, 3, 3))]
+    assert torch.autograd.gradcheck(lambda *x: mph.predict_views(mph.spread_along_rays(*x, g), g, views, 4)[0], inputs)
 
 
 def test_what_is_not_understood_is_refused(rng):
@@ -149,14 +131,17 @@ def test_what_is_not_understood_is_refused(rng):
     image, shares = rng.random((23, 26)), rng.random(g.shape)
     empty = shares.copy()
     empty[3, 5] = 0
-    refused(lambda: mph.spread_along_rays(image.T, shares, g), "image", "23 x 26")
-    refused(lambda: mph.spread_along_rays(image, shares[..., 0], g), "depth distribution", "26 x 23 x 4")
-    refused(lambda: mph.spread_along_rays(image, -shares, g), "0 or more")
-    refused(lambda: mph.spread_along_rays(image, empty, g), "column 3, row 5")
-    refused(lambda: mph.spread_along_rays(image, np.nan * shares, g), "finite")
-    refused(lambda: mph.predict_views(image, g, views), "expected shape")
-    refused(lambda: mph.predict_views(shares, views, views), "PerspectiveGrid")
-    refused(lambda: mph.predict_views(shares, g, views[0:0]), "one or more views")
-    refused(lambda: mph.predict_views(shares, g, views, 0), "planes")
     predicted, covered = mph.predict_views(shares, g, views, 4)
-    refused(lambda: mph.prediction_errors(image, predicted, covered), "one shape", "23 x 26")
+    for function, arguments, words in (
+        (mph.spread_along_rays, (image.T, shares, g), ("image", "23 x 26")),
+        (mph.spread_along_rays, (image, shares[..., 0], g), ("depth distribution", "26 x 23 x 4")),
+        (mph.spread_along_rays, (image, -shares, g), ("0 or more",)),
+        (mph.spread_along_rays, (image, empty, g), ("column 3, row 5",)),
+        (mph.spread_along_rays, (image, np.nan * shares, g), ("finite",)),
+        (mph.predict_views, (image, g, views), ("expected shape",)),
+        (mph.predict_views, (shares, views, views), ("PerspectiveGrid",)),
+        (mph.predict_views, (shares, g, views[0:0]), ("one or more views",)),
+        (mph.predict_views, (shares, g, views, 0), ("planes",)),
+        (mph.prediction_errors, (image, predicted, covered), ("one shape", "23 x 26")),
+    ):
+        refused(functools.partial(function, *arguments), *words)

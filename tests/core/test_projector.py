@@ -12,7 +12,6 @@ from mphdrr.core.volumes.volume import Volume
 
 from .conftest import BACKENDS
 
-FAST_BACKENDS = BACKENDS[1:]
 TOLERANCE = {"numpy": 1e-9, "torch": 1e-5, "cpu": 1e-5}
 
 
@@ -30,26 +29,21 @@ def affine(linear, shape, center=(3.0, -5.0, 2.0)):
     return a
 
 
-def linear_parts(seed=0):
-    rng = np.random.default_rng(seed)
-    return {
-        "plain": np.eye(3) * 2.0,
-        "anisotropic": np.diag([0.7, 2.0, 3.5]),
-        "mirrored": np.diag([-1.0, 1.5, 1.0]),
-        "permuted": np.eye(3)[[2, 0, 1]] * 1.5,
-        "rotated": rotation(rng) * 1.3,
-        "sheared": rotation(rng) @ (np.diag([1.0, 1.4, 0.8]) + np.triu(rng.uniform(-0.5, 0.5, (3, 3)), 1)),
-    }
-
-
-LINEAR = linear_parts()
+_rng = np.random.default_rng(0)
+LINEAR = {
+    "plain": np.eye(3) * 2.0,
+    "anisotropic": np.diag([0.7, 2.0, 3.5]),
+    "mirrored": np.diag([-1.0, 1.5, 1.0]),
+    "permuted": np.eye(3)[[2, 0, 1]] * 1.5,
+    "rotated": rotation(_rng) * 1.3,
+    "sheared": rotation(_rng) @ (np.diag([1.0, 1.4, 0.8]) + np.triu(_rng.uniform(-0.5, 0.5, (3, 3)), 1)),
+}
 SHAPES = [(5, 7, 6), (1, 1, 1), (1, 9, 4), (6, 5, 1)]
 
 
-def clipped_length(grid, sources, targets, low=(0, 0, 0), high=None):
-    """Length in mm of each ray inside the box of voxels low..high - 1, by the slab method on voxel centres."""
-    low = np.array(low) - 0.5
-    high = np.array(grid.shape if high is None else high) - 0.5
+def clipped_length(grid, sources, targets, index):
+    """Return the length in mm of each ray inside a voxel, by the slab method on voxel centres."""
+    low, high = np.array(index) - 0.5, np.array(index) + 0.5
     inverse = np.linalg.inv(grid.affine)
     a = np.c_[sources, np.ones(len(sources))] @ inverse.T[:, :3]
     b = np.c_[targets, np.ones(len(targets))] @ inverse.T[:, :3]
@@ -133,69 +127,19 @@ def some_views(rng, shape=(6, 5), n=3, distance=60.0):
 @pytest.mark.parametrize("backend", BACKENDS)
 @pytest.mark.parametrize("shape", SHAPES)
 @pytest.mark.parametrize("kind", LINEAR)
-def test_constant_box_gives_clipped_length(backend, shape, kind):
+def test_integrals_are_the_sums_of_the_voxels_clipped_lengths(backend, shape, kind):
+    """An independent Siddon of voxels amid empty margins, which are cropped."""
     rng = np.random.default_rng(1)
-    grid = Grid(shape, affine(LINEAR[kind], shape))
+    array = np.pad(rng.uniform(0.5, 3, shape).astype(np.float32), rng.integers(0, 3, (3, 2)))
+    grid = Grid(array.shape, affine(LINEAR[kind], array.shape))
     sources, targets = random_rays(rng, grid)
-    volume = Volume(np.full(shape, 3.0, np.float32), grid)
-    expected = 3.0 * clipped_length(grid, sources, targets)
-    assert np.count_nonzero(expected) > 20
-    np.testing.assert_allclose(
-        trace_rays(volume, sources, targets, backend), expected, rtol=TOLERANCE[backend], atol=TOLERANCE[backend]
-    )
+    expected = sum(array[tuple(i)] * clipped_length(grid, sources, targets, i) for i in np.argwhere(array))
+    assert np.count_nonzero(expected) > 10
+    integrals = trace_rays(Volume(array, grid), sources, targets, backend)
+    np.testing.assert_allclose(integrals, expected, rtol=TOLERANCE[backend], atol=TOLERANCE[backend])
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
-def test_box_inside_a_grid_gives_clipped_length(backend):
-    """Empty margins (which are cropped) change nothing."""
-    shape = (12, 10, 9)
-    grid = Grid(shape, affine(LINEAR["sheared"], shape))
-    array = np.zeros(shape, np.float32)
-    array[3:8, 2:3, 4:9] = 2.0
-    sources, targets = random_rays(np.random.default_rng(2), grid, 2000)
-    expected = 2.0 * clipped_length(grid, sources, targets, (3, 2, 4), (8, 3, 9))
-    assert np.count_nonzero(expected) > 20
-    got = trace_rays(Volume(array, grid), sources, targets, backend)
-    np.testing.assert_allclose(got, expected, rtol=TOLERANCE[backend], atol=TOLERANCE[backend])
-
-
-@pytest.mark.parametrize("backend", BACKENDS)
-def test_sum_of_single_voxels_lengths(backend):
-    """Every voxel's own clipped length, times its value, summed: an independent Siddon of a small random volume."""
-    shape = (3, 4, 2)
-    rng = np.random.default_rng(3)
-    grid = Grid(shape, affine(LINEAR["rotated"], shape))
-    array = rng.random(shape, dtype=np.float32)
-    sources, targets = random_rays(rng, grid)
-    expected = sum(float(array[i]) * clipped_length(grid, sources, targets, i, np.add(i, 1)) for i in np.ndindex(shape))
-    got = trace_rays(Volume(array, grid), sources, targets, backend)
-    np.testing.assert_allclose(got, expected, rtol=TOLERANCE[backend], atol=TOLERANCE[backend])
-
-
-@pytest.mark.parametrize("backend", BACKENDS)
-def test_ball_converges_to_its_chords(backend):
-    radius = 10.0
-    rng = np.random.default_rng(4)
-    sources = rng.normal(size=(300, 3))
-    sources *= 50 / np.linalg.norm(sources, axis=1, keepdims=True)
-    aim = rng.normal(size=(300, 3))
-    aim *= rng.uniform(0, 8, (300, 1)) / np.linalg.norm(aim, axis=1, keepdims=True)
-    targets = 2 * aim - sources
-    k = (targets - sources) / np.linalg.norm(targets - sources, axis=1, keepdims=True)
-    miss = np.linalg.norm(np.cross(sources, k), axis=1)
-    chord = 2 * np.sqrt(radius**2 - miss**2)
-    errors = []
-    for n in (16, 32, 64):
-        grid = Grid.centered((n,) * 3, 24 / n)
-        x = grid.affine[0, 3] + np.arange(n) * grid.spacing[0]
-        inside = x[:, None, None] ** 2 + x[:, None] ** 2 + x**2 < radius**2
-        integral = trace_rays(Volume(inside.astype(np.float32), grid), sources, targets, backend)
-        errors.append(np.abs(integral - chord).mean())
-    assert errors[1] < 0.65 * errors[0] and errors[2] < 0.65 * errors[1]
-    assert errors[2] < 0.15
-
-
-@pytest.mark.parametrize("backend", FAST_BACKENDS)
+@pytest.mark.parametrize("backend", BACKENDS[1:])
 @pytest.mark.parametrize("shape", SHAPES)
 @pytest.mark.parametrize("kind", LINEAR)
 def test_backends_agree_on_nasty_rays(backend, shape, kind):
@@ -242,7 +186,7 @@ def test_adjoint(backend, kind):
     A = Projector(Grid(shape, affine(LINEAR[kind], shape)), some_views(rng), backend=backend, threads=2)
     x, y = rng.normal(size=shape), rng.normal(size=A.shape_out)
     Ax, ATy = A(x), A.T(y)
-    assert Ax.any() and ATy.shape == shape and A.T.T is A
+    assert Ax.any() and ATy.shape == shape and A.T.T is A and not A(np.zeros(shape)).any()
     scale = np.linalg.norm(Ax) * np.linalg.norm(y)
     assert abs(np.vdot(Ax.astype(float), y) - np.vdot(x, ATy.astype(float))) < scale * (
         1e-12 if backend == "numpy" else 1e-5
@@ -263,17 +207,6 @@ def test_adjoint_matrix_is_the_transpose(backend):
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
-def test_linearity(backend):
-    rng = np.random.default_rng(7)
-    shape = (6, 5, 4)
-    A = Projector(Grid(shape, affine(LINEAR["rotated"], shape)), some_views(rng), backend=backend)
-    a, b = rng.random(shape), rng.random(shape)
-    tolerance = TOLERANCE[backend]
-    np.testing.assert_allclose(A(2 * a - 3 * b), 2 * A(a) - 3 * A(b), rtol=tolerance, atol=10 * tolerance)
-    assert not A(np.zeros(shape)).any()
-
-
-@pytest.mark.parametrize("backend", BACKENDS)
 def test_projector_images_are_the_views_rays(backend):
     rng = np.random.default_rng(8)
     shape = (6, 5, 4)
@@ -285,6 +218,10 @@ def test_projector_images_are_the_views_rays(backend):
     for m in range(2):
         np.testing.assert_allclose(images[m].ravel(), trace_rays(volume, *views.rays(m), backend), rtol=1e-6)
     np.testing.assert_array_equal(np.stack(list(A.iter_views(volume))), images)
+    begun = A.iter_views(volume)
+    next(begun)
+    begun.close()
+    np.testing.assert_array_equal(A(volume), images)
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
@@ -311,30 +248,3 @@ def test_threads_change_nothing(backend):
     np.testing.assert_array_equal(y, two(x))
     np.testing.assert_allclose(one.T(y), two.T(y), rtol=2e-6)
     np.testing.assert_array_equal(two.T(y), two.T(y))
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("backend", BACKENDS)
-def test_hypothesis_box_in_any_affine(backend):
-    hypothesis = pytest.importorskip("hypothesis", reason="hypothesis is not installed")
-    from hypothesis import strategies as st
-
-    coordinate = st.floats(-40, 40, allow_nan=False).map(lambda x: round(x, 3))
-    point = st.tuples(coordinate, coordinate, coordinate)
-
-    @hypothesis.settings(max_examples=150, deadline=None, derandomize=True)
-    @hypothesis.given(
-        seed=st.integers(0, 2**32 - 1),
-        shape=st.tuples(*[st.integers(1, 6)] * 3),
-        ends=st.lists(st.tuples(point, point), min_size=1, max_size=8),
-    )
-    def law(seed, shape, ends):
-        linear = rotation(np.random.default_rng(seed)) @ np.diag(np.random.default_rng(seed).uniform(0.3, 4, 3))
-        grid = Grid(shape, affine(linear, shape))
-        sources, targets = np.array(ends, float).transpose(1, 0, 2)
-        volume = Volume(np.ones(shape, np.float32), grid)
-        expected = clipped_length(grid, sources, targets)
-        got = trace_rays(volume, sources, targets, backend)
-        np.testing.assert_allclose(got, expected, rtol=TOLERANCE[backend], atol=10 * TOLERANCE[backend])
-
-    law()

@@ -11,10 +11,9 @@ import pytest
 
 import mphdrr.core as mph
 import mphdrr.core.memory
-from mphdrr.core.errors import InputError, InputWarning
+from mphdrr.core.errors import InputWarning
 from mphdrr.core.geometry.grid import Grid
 from mphdrr.core.geometry.views import Views
-from mphdrr.core.progress import Cancelled
 from mphdrr.core.projector import Projector, Transmission, trace_rays
 from mphdrr.core.rays import backends
 from mphdrr.core.rays.backends import cpu
@@ -39,7 +38,6 @@ def test_types_out():
         np.testing.assert_allclose(y, reference(ONES), rtol=1e-5)
     assert A.T(y).dtype == np.float32 and A.T(y).shape == GRID.shape
     assert trace_rays(Volume(ONES, GRID), [0, 0, -9], [0, 0, 9]).dtype == np.float32
-    assert trace_rays(Volume(ONES, GRID), [0, 0, -9], np.zeros((0, 3))).shape == (0,)
 
 
 def test_inputs_are_not_changed():
@@ -52,11 +50,14 @@ def test_inputs_are_not_changed():
     np.testing.assert_array_equal(y, kept)
 
 
-def test_no_views_give_no_images():
-    none = Views(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 3)), (6, 7))
-    A = Projector(GRID, none)
+def test_no_views_give_no_images_and_no_rays_no_integrals():
+    A = Projector(GRID, VIEWS[:0])
     assert A(ONES).shape == (0, 6, 7)
-    assert not A.T(A(ONES)).any()
+    np.testing.assert_array_equal(A.T(A(ONES)), np.zeros(GRID.shape))
+    volume = Volume(ONES, GRID)
+    for none in ([], np.empty((0, 3))):
+        assert trace_rays(volume, none, none).shape == (0,)
+        assert trace_rays(volume, [0, 0, -9], none).shape == (0,)
 
 
 def test_bad_input_is_one_clear_line():
@@ -86,22 +87,10 @@ def test_bad_input_is_one_clear_line():
     refused(lambda: trace_rays(volume, np.zeros((2, 2)), np.zeros((2, 3))), "sources", "expected shape 2 x 3")
 
 
-def test_no_rays_give_no_integrals():
-    volume = Volume(ONES, GRID)
-    for none in ([], np.empty((0, 3))):
-        assert trace_rays(volume, none, none).shape == (0,)
-        assert trace_rays(volume, [0, 0, -9], none).shape == (0,)
-
-
 def test_volume_of_the_same_grid_read_from_a_file_is_accepted():
     affine = GRID.affine.copy()
     affine[:3] *= 1 + 1e-7
     Projector(GRID, VIEWS)(Volume(ONES, Grid(GRID.shape, affine)))
-
-
-def test_unknown_backend_lists_the_choices():
-    refused(lambda: Projector(GRID, VIEWS, backend="gpu"), "'gpu'", "auto, cpu, torch, numpy, cuda")
-    refused(lambda: trace_rays(Volume(ONES, GRID), [0, 0, 0], [1, 1, 1], "gpu"), "'gpu'", "cpu")
 
 
 def without(monkeypatch, *missing):
@@ -116,7 +105,9 @@ def without(monkeypatch, *missing):
     backends._warn_slower.cache_clear()
 
 
-def test_missing_library_is_named(monkeypatch):
+def test_unknown_backends_and_missing_libraries_are_named(monkeypatch):
+    refused(lambda: Projector(GRID, VIEWS, backend="gpu"), "'gpu'", "auto, cpu, torch, numpy, cuda")
+    refused(lambda: trace_rays(Volume(ONES, GRID), [0, 0, 0], [1, 1, 1], "gpu"), "'gpu'", "cpu")
     without(monkeypatch, "cpu", "torch")
     refused(lambda: Projector(GRID, VIEWS, backend="cpu"), "backend 'cpu'", "no kernels")
     refused(lambda: Projector(GRID, VIEWS, backend="torch"), "pip install torch")
@@ -133,56 +124,25 @@ def test_auto_falls_back_and_says_so_once(monkeypatch):
     backends._warn_slower.cache_clear()
 
 
-def test_auto_is_cpu():
-    assert Projector(GRID, VIEWS).backend == "cpu"
-
-
-def test_the_old_name_of_cpu_is_taken_silently():
+def test_auto_is_cpu_and_its_old_name_is_taken_silently():
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         A = Projector(GRID, VIEWS, backend="numba")
         integral = trace_rays(Volume(ONES, GRID), [0, 0, -9], [0, 0, 9], "numba")
-    assert A.backend == "cpu" and integral == 3
-
-
-def test_progress_counts_the_views_and_can_cancel():
-    A = Projector(GRID, VIEWS)
-    for operator, x in ((A, ONES), (A.T, np.ones(A.shape_out))):
-        calls = []
-        operator(x, progress=lambda done, total, calls=calls: calls.append((done, total)))
-        assert calls == [(0, 2), (1, 2), (2, 2)]
-
-        def cancel(done, total):
-            if done == 1:
-                raise Cancelled
-
-        with pytest.raises(Cancelled):
-            operator(x, progress=cancel)
-        assert operator(x) is not None
-    images = A.iter_views(ONES)
-    next(images)
-    images.close()
-    with pytest.raises(InputError):
-        A.iter_views(ONES[1:])  # immediately, not at the first image
+    assert A.backend == Projector(GRID, VIEWS).backend == "cpu" and integral == 3
 
 
 def test_what_cannot_fit_is_refused_before_it_starts(monkeypatch):
+    """Also a copy of a number's broadcast, and the rays of an image."""
+    large = Grid.centered((10**5, 10**5, 10**4), 1.0)
+    one = np.broadcast_to(np.float32(1), large.shape)
+    refused(lambda: Projector(large, VIEWS)(one), "volume of 100000 x 100000 x 10000", "of memory")
+    views = Views([[0, 0, -9]], [[0, 0, 9]], [[1, 0, 0]], [[0, 1, 0]], shape=(10**6, 10**6))
+    refused(lambda: next(Projector(GRID, views).iter_views(ONES)), "an image of 1000000 x 1000000 pixels", "of memory")
     monkeypatch.setattr(mphdrr.core.memory, "available", lambda: 200)
     A = Projector(GRID, VIEWS, threads=1)
     refused(lambda: A(ONES), "5 x 4 x 3 voxels", "2 images of 6 x 7", "memory")
     refused(lambda: A.T(np.ones(A.shape_out)), "5 x 4 x 3", "memory")
-
-
-def test_a_copy_that_cannot_fit_is_refused_before_it_is_made():
-    grid = Grid.centered((10**5, 10**5, 10**4), 1.0)
-    of_a_number = np.broadcast_to(np.float32(1), grid.shape)
-    refused(lambda: Projector(grid, VIEWS)(of_a_number), "volume of 100000 x 100000 x 10000", "of memory")
-
-
-def test_rays_that_cannot_fit_are_refused_before_they_are_made():
-    views = Views([[0, 0, -9]], [[0, 0, 9]], [[1, 0, 0]], [[0, 1, 0]], shape=(10**6, 10**6))
-    images = Projector(GRID, views).iter_views(ONES)
-    refused(lambda: next(images), "an image of 1000000 x 1000000 pixels", "of memory")
 
 
 def test_adjoint_uses_fewer_threads_when_memory_is_short(monkeypatch):
@@ -211,11 +171,6 @@ def test_forked_processes_project_too():
     """Threads do not survive a fork, which is how data loaders start their workers."""
     done = run_python(FORK, timeout=600)
     assert done.stdout.strip() == "1", done.stderr
-
-
-def test_the_adjoint_of_no_views():
-    images = np.ones((0, *VIEWS.shape))
-    np.testing.assert_array_equal(Projector(GRID, VIEWS[:0]).T(images), np.zeros(GRID.shape))
 
 
 @pytest.mark.parametrize("pixel_points", [1, 150])

@@ -16,6 +16,8 @@ from mphdrr.core.runs.recipe import Recipe
 from mphdrr.core.runs.run_recipe import euler_degrees, phantom_pose
 from mphdrr.core.runs.settings import SETTINGS
 
+from .conftest import refused, refused_command
+
 AS_SHIPPED = True  # compared with voxels of every Python
 
 DATA = Path(__file__).parent / "data"
@@ -49,15 +51,9 @@ def test_a_recipe_comes_back_from_its_file(tmp_path):
         ("model = 3", r"model: expected one of the tables \[system\], \[volume\]"),
         ("[modle]\nkind = 1", r"modle: expected one of the tables"),
         ("[model]\ntiem = 1", "model.tiem: no such setting; expected kind, time, "),
-        (
-            "[model]\nkind = 'spect'",
-            "model.kind: expected one of transmission, emission, spectral, inverse-square, got 'spect'",
-        ),
+        ("[model]\nkind = 'spect'", "expected one of transmission, emission, spectral, inverse-square, got 'spect'"),
         ("[model]\nkind = 'emission'\ntime = 0", r"model.time: expected a number above 0 \(s\), got 0"),
-        (
-            "[model]\nkind = 'emission'\naperture_points = true",
-            "aperture_points: expected a whole number of 1 or more",
-        ),
+        ("[model]\nkind = 'emission'\naperture_points = true", "aperture_points: expected a whole number of 1 or "),
         ("[model]\nkind = 'emission'\naperture_mu = 'wood'", "expected one of tungsten, .* or a number above 0"),
         ("[model]\ntime = 5", r"model.time \(--time\) needs model.kind = emission \(--emission\)"),
         ("[phantom]\nkind = 'derenzo'\nspheres = 3", "phantom.spheres: no such setting; .*rod_diameters"),
@@ -108,8 +104,7 @@ def test_a_changed_recipe_keeps_what_still_holds_and_no_more():
     assert moved["phantom.sphere_activity"] == 3
     assert "phantom.sphere_activity" not in made.updated({"phantom.kind": "jaszczak"}).given
     only_matrix = Recipe({"phantom.matrix": made["phantom.matrix"]}).updated({"phantom.position": (9, 0, 0)})
-    with pytest.raises(mph.InputError, match="another pose"):
-        phantom_pose(only_matrix)
+    refused(lambda: phantom_pose(only_matrix), "another pose")
 
 
 @pytest.mark.parametrize("centered", [False, True])
@@ -129,8 +124,7 @@ def test_a_run_made_again_is_attenuated_again(centered, workbook, tmp_path, caps
     assert runs[0].projections.max() > 0
     np.testing.assert_array_equal(runs[1].projections, runs[0].projections)
     if not centered:
-        with pytest.raises(mph.InputError, match="needs its mu as well"):
-            next(mph.run_recipe(runs[0].recipe, volume=runs[0].volume))
+        refused(lambda: next(mph.run_recipe(runs[0].recipe, volume=runs[0].volume)), "needs its mu as well")
 
 
 @pytest.mark.long
@@ -149,23 +143,18 @@ def test_a_phantom_has_settings_apart_from_those_of_its_grid(kind, workbook, tmp
         assert run.recipe == runs[0].recipe and run.recipe["phantom.spacing"] == (30, 31, 32)
 
 
-def test_every_entry_can_be_set_on_the_command_line(workbook, tmp_path, capsys):
+def test_every_entry_can_be_set_on_the_command_line(workbook, tmp_path, capsys, command):
     entries = ["model.kind=emission", "model.edge=path", "model.aperture_mu=2.5", "model.window=[60, 80]",
                "model.isotope=Tl-201", "phantom.kind=points", "phantom.counts=[2, 1, 1]"]  # fmt: skip
     words = [word for entry in entries for word in ("--set", entry)]
     assert main(["project", str(workbook), *words, "--write-recipe", str(tmp_path / "r.toml")]) == 0
     recipe = mph.read_recipe(tmp_path / "r.toml")
     assert (recipe["model.aperture_mu"], recipe["model.window"], recipe["phantom.counts"]) == (2.5, (60, 80), (2, 1, 1))
-    assert (
-        main(
-            ["project", str(tmp_path / "r.toml"), "--set", "model.window=", "--write-recipe", str(tmp_path / "s.toml")]
-        )
-        == 0
-    )
+    command("project", tmp_path / "r.toml", "--set", "model.window=", "--write-recipe", tmp_path / "s.toml")
     assert "model.window" not in mph.read_recipe(tmp_path / "s.toml").given
     for wrong, said in (("a=1", "expected TABLE.NAME"), ("model.kind", "expected KEY=VALUE"), ("model.x=1", "no such")):
-        assert main(["project", str(workbook), "--set", wrong, "--write-recipe", str(tmp_path / "t.toml")]) == 1
-        assert said in capsys.readouterr().err
+        words = ["project", workbook, "--set", wrong, "--write-recipe", tmp_path / "t.toml"]
+        assert said in refused_command(capsys, *words)
 
 
 def test_runs_of_states_draw_their_own_noise(tmp_path, workbook):
@@ -177,10 +166,8 @@ def test_runs_of_states_draw_their_own_noise(tmp_path, workbook):
         "model.kind": "emission", "detector.rows": 4, "detector.columns": 4, "noise.seed": 7,
     })  # fmt: skip
     runs = list(mph.run_recipe(recipe))
-    assert [(run.seed, run.recipe["noise.seed"], run.settings["volume"]) for run in runs] == [
-        (7, 7, "1.npz"),
-        (8, 8, "2.npz"),
-    ]
+    drawn = [(run.seed, run.recipe["noise.seed"], run.settings["volume"]) for run in runs]
+    assert drawn == [(7, 7, "1.npz"), (8, 8, "2.npz")]
 
 
 def test_angles_and_matrix_say_the_same_pose(rng):
@@ -192,8 +179,7 @@ def test_angles_and_matrix_say_the_same_pose(rng):
     np.testing.assert_allclose(phantom_pose(both), pose)
     moved = both.updated({"phantom.position": (0, 0, 0)})
     assert "phantom.matrix" not in moved.given
-    with pytest.raises(mph.InputError, match="another pose"):
-        phantom_pose(Recipe({**both.given, "phantom.position": (0, 0, 0)}))
+    refused(lambda: phantom_pose(Recipe({**both.given, "phantom.position": (0, 0, 0)})), "another pose")
     assert euler_degrees(np.diag([2.0, 1, 1, 1])) is None
 
 

@@ -18,10 +18,14 @@ from mphdrr.addon.cli import main
 from mphdrr.core.cli.reconstruct import settings_line
 from mphdrr.core.figures.page import DARK, Page
 from mphdrr.core.figures.reconstructions import LIGHTS, draw
-from mphdrr.core.reconstruction.methods import METHOD_FILES, METHODS, PRIORS, Method
-from mphdrr.core.runs.recipe import recipe_of_tables
-from mphdrr.core.runs.reconstructing import model_of, reconstruction_grid
+from mphdrr.core.reconstruction.method_files import METHOD_FILES
+from mphdrr.core.reconstruction.methods import METHODS, Method
+from mphdrr.core.reconstruction.priors import PRIORS
+from mphdrr.core.runs.recipe import recipe_from_tables
+from mphdrr.core.runs.reconstructing import reconstruction_grid, reconstruction_model
 from mphdrr.core.runs.settings import SETTINGS
+
+from .conftest import refused
 
 COUNTS = {"model.kind": "emission", "model.time": 600.0, "model.aperture_points": 9, "model.intrinsic_fwhm": 1.0,
           "model.pixel_points": 2, "model.tolerance": 9.0, "detector.rows": 16, "detector.columns": 16,
@@ -45,7 +49,7 @@ def command(*words: object, said: str = "") -> None:
     assert main(["reconstruct", *map(str, words)]) == 0, said
 
 
-def refused(capsys, *words: object) -> str:
+def refusal(capsys, *words: object) -> str:
     assert main(["reconstruct", *map(str, words)]) == 1
     text = capsys.readouterr().err
     (line,) = [line for line in text.splitlines() if not line.startswith(("mphdrr: warning", "iteration"))]
@@ -80,10 +84,8 @@ def test_runs_of_version_0_1_0_reconstruct_when_the_model_is_given(suffix, tmp_p
     )
     A = mph.Projector(by_recipe.grid, run.views, model)
     found = mph.mlem(A, run.projections, iterations=3)
-    assert by_recipe.array.max() > 0
-    np.testing.assert_allclose(
-        A(by_recipe.array).sum(), A(found.volume.array).sum(), rtol=0.02
-    )  # the same activity; the recipe's hole is modelled as reconstructions do
+    # The same activity; the recipe's hole is modelled as reconstructions do.
+    assert A(by_recipe.array).sum() == pytest.approx(A(found.volume.array).sum(), rel=0.02) != 0
 
 
 @pytest.mark.parametrize(
@@ -165,7 +167,7 @@ def radiograph(scanner) -> mph.ProjectionRun:
 
 def projector(run: mph.ProjectionRun, recipe: mph.Recipe) -> mph.Projector:
     recipe = run.recipe.updated(recipe.given)
-    return mph.projector_of_run(run, reconstruction_grid(run, recipe), None, model_of(run, recipe))
+    return mph.projector_of_run(run, reconstruction_grid(run, recipe), None, reconstruction_model(run, recipe))
 
 
 @pytest.mark.long
@@ -186,7 +188,7 @@ def test_each_method_has_its_own_defaults_wherever_it_is_chosen(name, run, radio
     state, output = tmp_path / "s.h5", ["-o", tmp_path / "v.npz"]
     command(tmp_path / "run.npz", *typed, "--quiet", "--save-state", state, *output)
     by_command, by_recipe = mph.read_reconstruction(state), mph.reconstruct_run(run, recipe)
-    again = mph.reconstruct_run(run, recipe_of_tables(by_command.settings["recipe"]))
+    again = mph.reconstruct_run(run, recipe_from_tables(by_command.settings["recipe"]))
     for found in (by_command, by_recipe, again):
         np.testing.assert_array_equal(found.volume.array, expected.volume.array)
         assert expected.settings.items() <= found.settings.items()
@@ -230,7 +232,7 @@ def test_a_methods_own_settings_reach_it(name, typed, given, run, radiograph, tm
     A = projector(run, mph.read_recipe(tmp_path / "how.toml"))
     expected = getattr(mph, name)(A, run.projections, iterations=3, **given)
     np.testing.assert_array_equal(mph.read_volume(tmp_path / "v.npz").array, expected.volume.array)
-    other = refused(capsys, tmp_path / "run.npz", *small, *typed, "--method", "cgls", "-o", tmp_path / "no.npz")
+    other = refusal(capsys, tmp_path / "run.npz", *small, *typed, "--method", "cgls", "-o", tmp_path / "no.npz")
     assert " needs " in other and f"reconstruction.method = {name}" in other
 
 
@@ -281,10 +283,10 @@ def test_a_file_is_a_method_without_iterations_or_an_objective(toy, radiograph, 
         (["--start", tmp_path / "a.npz"], "start: Even has no start"),
         (["--stop-seconds", "1"], "stop: Even has no stop"),
     ):
-        assert words in refused(capsys, *small, "--method", toy, *more, "-o", tmp_path / "no.npz")
+        assert words in refusal(capsys, *small, "--method", toy, *more, "-o", tmp_path / "no.npz")
     toy.write_text("much", encoding="utf-8")
-    assert refused(capsys, *small, "--method", toy, "-o", tmp_path / "no.npz").endswith("model.toy: expected a number")
-    said = refused(capsys, *small, "--method", "model.onnx", "-o", tmp_path / "no.npz")
+    assert refusal(capsys, *small, "--method", toy, "-o", tmp_path / "no.npz").endswith("model.toy: expected a number")
+    said = refusal(capsys, *small, "--method", "model.onnx", "-o", tmp_path / "no.npz")
     assert "expected one of osem, mlem, bsrem, sirt, cgls, tv, ostr or a file (.pt, .toy), got 'model.onnx'" in said
 
 
@@ -294,7 +296,7 @@ def test_a_state_of_other_settings_is_refused_in_a_line(file, tmp_path, capsys):
     command(file, *small, "--subsets", "4", "--save-state", state, "-o", tmp_path / "v.npz")
     for more, said in ((["--subsets", "5"], "subsets 4, now 5"), (["--subsets", "4", "--ignore-blur"], "objective"),
                        (["--subsets", "4", "--background", "2"], "background 0.0, now ")):  # fmt: skip
-        line = refused(capsys, file, *small, *more, "--resume", state, "-o", tmp_path / "no.npz")
+        line = refusal(capsys, file, *small, *more, "--resume", state, "-o", tmp_path / "no.npz")
         assert line.startswith("mphdrr: start: this reconstruction is of other") and said in line and "--start" in line
         command(file, *small, *more, "--start", state, "-o", tmp_path / "yes.npz")
     assert not (tmp_path / "no.npz").exists()
@@ -343,7 +345,7 @@ def test_voxels_cover_the_roi_and_the_model_is_that_of_the_run(run):
 
     def model(**changes):
         recipe = run.recipe.updated({key.replace("__", "."): value for key, value in changes.items()})
-        found = model_of(run, recipe)
+        found = reconstruction_model(run, recipe)
         return found["model.hole"], found["model.aperture_points"], found["model.intrinsic_fwhm"]
 
     assert model() == ("auto", None, 1.0)  # the whole hole has no points
@@ -356,9 +358,7 @@ def test_voxels_cover_the_roi_and_the_model_is_that_of_the_run(run):
     assert model(model__hole="depth") == ("auto", None, 1.0)
     assert model(model__hole="point") == ("rays", 1, 1.0)
     assert model(model__crystal_mu="NaI", model__depth_layers=2) == ("auto", None, 1.0)
-    with pytest.warns(
-        mph.InputWarning, match="rays through 7 points, not of the whole hole by depth: the backend is numpy"
-    ):
+    with pytest.warns(mph.InputWarning, match="rays through 7 points, .* whole hole by depth: the backend is numpy"):
         assert model(compute__backend="numpy") == ("rays", 7, 1.0)
     centre = reconstruction_grid(run, run.recipe.updated({"reconstruction.center": (1, 2, 3)})).center
     np.testing.assert_allclose(centre, (1, 2, 3))
@@ -396,11 +396,8 @@ def test_the_attenuation_of_the_run_is_modelled_unless_it_is_to_be_ignored(scann
              "phantom.voxels": 20, "phantom.spacing": 5.0, "detector.rows": 8, "detector.columns": 8}  # fmt: skip
     (run,) = mph.run_recipe(mph.Recipe(COUNTS | water), scanner[::8])
     how = {"reconstruction.voxels": 12, "reconstruction.spacing": 8, "reconstruction.iterations": 3}
-    totals = [
-        mph.reconstruct_run(run, mph.Recipe(how | more)).volume.array.sum()
-        for more in ({}, {"reconstruction.ignore_attenuation": True})
-    ]
-    assert totals[1] < 0.8 * totals[0]
+    whole, less = (mph.Recipe(how | more) for more in ({}, {"reconstruction.ignore_attenuation": True}))
+    assert mph.reconstruct_run(run, less).volume.array.sum() < 0.8 * mph.reconstruct_run(run, whole).volume.array.sum()
 
 
 def test_the_picture_shows_slices_beside_the_truth_and_the_objective(run, file, tmp_path, capsys):
@@ -410,16 +407,7 @@ def test_the_picture_shows_slices_beside_the_truth_and_the_objective(run, file, 
     command(file, *SMALL, "--subsets", "5", "--picture", tmp_path / "p.svg")
     text = (tmp_path / "p.svg").read_text(encoding="utf-8")
     settings = "3 iterations, 5 subsets"
-    for words in (
-        "Reconstruction",
-        "Error",
-        "Truth, z = 4 mm",
-        "Log-likelihood",
-        "kBq/mL",
-        "error",
-        settings,
-        "20 mm",
-    ):
+    for words in ("Reconstruction", "Error", "Truth, z = 4 mm", "Log-likelihood", "kBq/mL", "error", settings, "20 mm"):
         assert f">{words}<" in text, words
     assert text.count("<image") == 11  # three slices of each, and two colour bars
     volume = mph.Volume(np.zeros((2, 2, 2)), mph.Grid.centered(2, 1.0))
@@ -445,16 +433,8 @@ def test_a_picture_as_low_as_an_editor_has_legible_texts_and_all_that_matters(ru
     page, grid = Page(1048, 223, DARK, 14.0), mph.Grid.centered(16, 6.0)
     rods = [("8 mm", "green", "0.12", "80 %"), ("6 mm", "amber", "0.81", "9 %"), ("4 mm", "red", "1.02", "-1 %"),
             ("2 mm", "", "voxels of 6 mm are larger than the rods", "")]  # fmt: skip
-    draw(
-        page,
-        mph.resample(run.volume, grid, "mean"),
-        [1.0, 2.0],
-        run.volume,
-        "Of it",
-        ["OSEM", "it flatters"],
-        "fit",
-        rods,
-    )
+    mean = mph.resample(run.volume, grid, "mean")
+    draw(page, mean, [1.0, 2.0], run.volume, "Of it", ["OSEM", "it flatters"], "fit", rods)
     page.write(tmp_path / "p.svg")
     marks = (tmp_path / "p.svg").read_text(encoding="utf-8")
     sizes = re.findall(r'<text x="([0-9.]+)" y="([0-9.]+)" font-size="([0-9.]+)"', marks)
@@ -469,16 +449,10 @@ def test_a_picture_as_low_as_an_editor_has_legible_texts_and_all_that_matters(ru
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        (
-            ["--hole", "depth", "--aperture-points", "7"],
-            "--aperture-points) does not go with reconstruction.hole = depth",
-        ),
+        (["--hole", "depth", "--aperture-points", "7"], "points) does not go with reconstruction.hole = depth"),
         (["--method", "tv"], "reconstruction.weight (--weight): missing; TV needs it"),
         (["--subsets", "11"], "subsets: expected at most the 10 views, got 11"),
-        (
-            ["--method", "mlem", "--subsets", "4"],
-            "reconstruction.subsets (--subsets) needs reconstruction.method = osem",
-        ),
+        (["--method", "mlem", "--subsets", "4"], ".subsets (--subsets) needs reconstruction.method = osem"),
         (["--method", "magic"], "reconstruction.method: expected one of osem, mlem"),
         (["--iterations", "0"], "reconstruction.iterations: expected a whole number of 1 or more"),
         (["--prior", "quadratic"], "reconstruction.weight (--weight): missing"),
@@ -492,18 +466,17 @@ def test_a_picture_as_low_as_an_editor_has_legible_texts_and_all_that_matters(ru
     ],
 )
 def test_what_cannot_be_is_refused_in_one_line(options, said, file, tmp_path, capsys):
-    assert said in refused(capsys, file, *options, "-o", tmp_path / "v.npz")
+    assert said in refusal(capsys, file, *options, "-o", tmp_path / "v.npz")
     assert not (tmp_path / "v.npz").exists()
 
 
 def test_wrong_runs_are_refused(radiograph, file, tmp_path, capsys, scanner):
-    assert "nothing to write" in refused(capsys, file)
+    assert "nothing to write" in refusal(capsys, file)
     mph.write_run(radiograph, tmp_path / "drr.npz")
-    said = refused(capsys, tmp_path / "drr.npz", "-o", tmp_path / "v.npz")
+    said = refusal(capsys, tmp_path / "drr.npz", "-o", tmp_path / "v.npz")
     assert "osem needs a run of counts, not of line integrals; for these images: sirt, cgls, tv" in said
     bare = mph.project_run(scanner[:4], radiograph.volume, (4, 4))
-    with pytest.raises(mph.InputError, match="holds no recipe"):
-        mph.reconstruct_run(bare)
+    refused(lambda: mph.reconstruct_run(bare), "holds no recipe")
     assert set(METHODS) >= {"osem", "mlem"}
 
 

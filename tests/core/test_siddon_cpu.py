@@ -82,12 +82,6 @@ def test_every_level_takes_rays_along_faces_edges_and_corners(level, kind, rng):
         close(cpu.forward(volume, *mapped), reference.forward(volume.astype(float), *mapped), kind)
 
 
-def test_no_rays():
-    mapped = Lattices(Grid.centered(4, 1.0)).mapped(index_rays, np.empty((0, 3)), np.empty((0, 3)))
-    assert cpu.forward(np.ones((4, 4, 4)), *mapped).shape == (0,)
-    assert cpu.derivatives(np.ones((4, 4, 4)), *mapped).shape == (0, 7)
-
-
 PRINT_LEVEL = "from mphdrr.core.rays.backends import cpu; print(cpu.levels()[cpu.level])"
 
 

@@ -12,13 +12,11 @@ POINT = np.array([12.0, -21, 17])
 
 
 def noisy_fits(views, modules, covariances, n, seed):
-    """Fits of n draws of a marker's images with noise of these covariances (N, 2, 2)."""
+    """Return fits of n draws of a marker's images with noise of these covariances (N, 2, 2), and the exact fit."""
     exact = mph.project_points(views, [POINT])[modules, 0]
     noise = np.random.default_rng(seed).normal(size=(n, len(modules), 2))
-    noise = np.einsum("nij,knj->kni", np.linalg.cholesky(covariances), noise)
-    return [mph.fit_marker(views, modules, exact + each, covariances) for each in noise], mph.fit_marker(
-        views, modules, exact, covariances
-    )
+    images = exact + np.einsum("nij,knj->kni", np.linalg.cholesky(covariances), noise)
+    return [mph.fit_marker(views, modules, pixels, covariances) for pixels in [*images, exact]]
 
 
 def general_covariances(n):
@@ -26,28 +24,17 @@ def general_covariances(n):
     return parts @ parts.swapaxes(1, 2) + 0.04 * np.eye(2)
 
 
-@pytest.mark.parametrize("detector", ["virtual", "real"])
-def test_exact_images_give_the_point(scanner, rng, detector):
-    views = scanner.views((256, 240), detector)
-    points = rng.uniform(-60, 60, (60, 3))
+@pytest.mark.parametrize("kind", ["virtual", "real", "odd", "odd and parallel"])
+def test_exact_images_give_the_point(scanner, rng, kind):
+    odd = kind.startswith("odd")
+    views, points = odd_views(kind != "odd") if odd else scanner.views((256, 240), kind), rng.uniform(-40, 40, (60, 3))
     pixels = mph.project_points(views, points)
     for i, point in enumerate(points):
-        modules = rng.choice(80, rng.integers(2, 9), replace=False)
-        assert np.abs(mph.triangulate(views, modules, pixels[modules, i]) - point).max() < 1e-9
-    everywhere = mph.fit_marker(views, np.arange(80), pixels[:, 0])
-    assert np.abs(everywhere.point - points[0]).max() < 1e-9 and everywhere.degrees == 157 and everywhere.p_value == 1
-
-
-@pytest.mark.parametrize("parallel", [False, True])
-def test_exact_images_of_odd_views_give_the_point(rng, parallel):
-    views = odd_views(parallel)
-    points = rng.uniform(-40, 40, (10, 3))
-    pixels = mph.project_points(views, points)
-    for i, point in enumerate(points):
-        for modules in ([0, 1], [5, 2], [4, 3, 5], range(6)):
-            modules = list(modules)
-            sigma = general_covariances(len(modules))
-            assert np.abs(mph.triangulate(views, modules, pixels[modules, i], sigma) - point).max() < 1e-9
+        modules = rng.choice(len(views), rng.integers(2, 7), replace=False)
+        sigma = general_covariances(len(modules)) if odd else 1.0
+        assert np.abs(mph.triangulate(views, modules, pixels[modules, i], sigma) - point).max() < 1e-9
+    fit = mph.fit_marker(views, np.arange(len(views)), pixels[:, 0])
+    assert np.abs(fit.point - points[0]).max() < 1e-9 and fit.degrees == 2 * len(views) - 3 and fit.p_value == 1
 
 
 def test_the_place_is_the_most_likely_one():
@@ -77,11 +64,10 @@ def test_the_place_is_the_most_likely_one():
 @pytest.mark.parametrize("parallel", [False, pytest.param(True, marks=pytest.mark.long)])
 def test_the_stated_covariance_holds_on_average(parallel):
     modules = [1, 4, 5]
-    fits, exact = noisy_fits(odd_views(parallel), modules, general_covariances(3), 1000, 1)
-    away = np.array([fit.point for fit in fits]) - POINT
-    own = np.array([d @ np.linalg.solve(fit.covariance, d) for d, fit in zip(away, fits, strict=True)])
+    *fits, exact = noisy_fits(odd_views(parallel), modules, general_covariances(3), 1000, 1)
+    distances = [(f.point - POINT) @ np.linalg.solve(f.covariance, f.point - POINT) for f in fits]
     # The mean of 1000 numbers of standard deviation sqrt(6) is known to 2.6 % of 3.
-    np.testing.assert_allclose([own.mean(), np.mean([f.chi2 for f in fits])], 3, rtol=0.05)
+    np.testing.assert_allclose([np.mean(distances), np.mean([f.chi2 for f in fits])], 3, rtol=0.05)
     np.testing.assert_allclose(np.mean([f.misfits for f in fits]), 2, rtol=0.05)
     counts = np.histogram([f.p_value for f in fits], 5, (0, 1))[0]
     assert np.abs(counts - 200).max() < 45  # 3.5 standard deviations
@@ -92,22 +78,20 @@ def test_the_stated_covariance_holds_on_average(parallel):
 def test_the_stated_covariance_holds_for_a_marker_in_the_scanner(scanner):
     """All of it to 5 %, measured in its own axes; 8000 draws know a variance to 1.6 %."""
     modules = [0, 17, 44, 71]
-    fits, exact = noisy_fits(scanner.views(), modules, np.tile(0.25 * np.eye(2), (4, 1, 1)), 8000, 4)
-    found = np.linalg.solve(np.linalg.cholesky(exact.covariance), (np.array([f.point for f in fits]) - POINT).T)
-    np.testing.assert_allclose(found @ found.T / len(fits), np.eye(3), atol=0.05)
+    *fits, exact = noisy_fits(scanner.views(), modules, np.tile(0.25 * np.eye(2), (4, 1, 1)), 8000, 4)
+    white = np.linalg.solve(np.linalg.cholesky(exact.covariance), (np.array([f.point for f in fits]) - POINT).T)
+    np.testing.assert_allclose(white @ white.T / len(fits), np.eye(3), atol=0.05)
 
 
 def test_p_values_are_those_of_chi2():
     stats = pytest.importorskip("scipy.stats", reason="scipy is not installed")
     views = odd_views()
     pixels = mph.project_points(views, [POINT])[:, 0]
-    for modules in ([0, 1], [0, 1, 2], [0, 1, 2, 3, 4, 5]):
+    for n in (2, 3, 6):
         for size in (0.1, 1.0, 6.0):
-            fit = mph.fit_marker(
-                views, modules, pixels[modules] + size * np.array([1, -1])[np.arange(len(modules)) % 2][:, None]
-            )
+            fit = mph.fit_marker(views, range(n), pixels[:n] + size * (-1) ** np.arange(n)[:, None])
             np.testing.assert_allclose(fit.p_value, stats.chi2.sf(fit.chi2, fit.degrees), rtol=1e-8)
-            if len(modules) > 2:
+            if n > 2:
                 np.testing.assert_allclose(fit.misfit_p_values, stats.chi2.sf(fit.misfits, 2), rtol=1e-8)
 
 
@@ -133,20 +117,24 @@ def test_of_two_images_none_is_called_wrong():
     assert fit.worst is None and np.isnan(fit.misfits).all() and fit.degrees == 1 and fit.p_value < 1e-6
 
 
-def test_images_that_give_no_place_are_refused(scanner):
-    views = odd_views()
-    pixels = mph.project_points(views, [POINT])[:, 0]
-    refused(lambda: mph.triangulate(views, [2], pixels[:1]), "two or more views", "got 1")
-    refused(lambda: mph.triangulate(views, 2, pixels[:1]), "two or more views")
-    refused(lambda: mph.triangulate(views, [2, 1, -4], pixels[:3]), "each view once", "view 2 2 times")
-    refused(lambda: mph.triangulate(views, [2, 6], pixels[:2]), "no view 6 among 6")
-    refused(lambda: mph.triangulate(views, [0.0, 1.0], pixels[:2]), "index of a view")
-    refused(lambda: mph.triangulate(views, [0, 1], pixels[:3]), "pixels", "2 x 2")
-    refused(lambda: mph.triangulate(views, [0, 1], pixels[:2], 0), "sigma", "more than 0")
-    refused(lambda: mph.triangulate(views, [0, 1], pixels[:2], [1, 2, 3]), "sigma", "shape 2")
-    lopsided = [np.eye(2), [[1, 2], [0, 1]]]
-    refused(lambda: mph.triangulate(views, [0, 1], pixels[:2], lopsided), "sigma", "1 is not")
-    refused(lambda: mph.triangulate(views, [0, 1], pixels[:2], [np.eye(2), np.ones((2, 2))]), "sigma", "1 is not")
+@pytest.mark.parametrize(
+    ("modules", "n_pixels", "sigma", "words"),
+    [
+        ([2], 1, 1.0, ("two or more views", "got 1")),
+        (2, 1, 1.0, ("two or more views",)),
+        ([2, 1, -4], 3, 1.0, ("each view once", "view 2 2 times")),
+        ([2, 6], 2, 1.0, ("no view 6 among 6",)),
+        ([0.0, 1.0], 2, 1.0, ("index of a view",)),
+        ([0, 1], 3, 1.0, ("pixels", "2 x 2")),
+        ([0, 1], 2, 0, ("sigma", "more than 0")),
+        ([0, 1], 2, [1, 2, 3], ("sigma", "shape 2")),
+        ([0, 1], 2, [np.eye(2), [[1, 2], [0, 1]]], ("sigma", "1 is not")),
+        ([0, 1], 2, [np.eye(2), np.ones((2, 2))], ("sigma", "1 is not")),
+    ],
+)
+def test_images_that_give_no_place_are_refused(modules, n_pixels, sigma, words):
+    pixels = mph.project_points(odd_views(), [POINT])[:n_pixels, 0]
+    refused(lambda: mph.triangulate(odd_views(), modules, pixels, sigma), *words)
 
 
 def pair(apart, parallel=False):
@@ -156,22 +144,17 @@ def pair(apart, parallel=False):
 
 
 def test_rays_that_leave_the_depth_unknown_are_refused():
-    refused(
-        lambda: mph.triangulate(pair(40), [0, 1], [[30, 40], [30, 40]]), "parallel", "depth of the point is unknown"
-    )
-    refused(
-        lambda: mph.triangulate(pair(40, True), [0, 1], [[30, 40], [20, 40]]),
-        "parallel",
-        "depth of the point is unknown",
-    )
-    # These meet behind the sources, as if swapped.
-    refused(lambda: mph.triangulate(pair(40), [0, 1], [[30, 40], [80, 40]]), "behind the source of image")
+    for views, second, words in (
+        (pair(40), [30, 40], ("parallel", "depth of the point is unknown")),
+        (pair(40, True), [20, 40], ("parallel", "depth of the point is unknown")),
+        (pair(40), [80, 40], ("behind the source of image",)),  # the rays meet there, as if swapped
+        (pair(1e-5), [30 - 2e-5, 40], ("parallel",)),  # 200 mm away
+    ):
+        pixels = [[30, 40], second]
+        refused(lambda views=views, pixels=pixels: mph.triangulate(views, [0, 1], pixels), *words)
     pixels = mph.project_points(pair(0.5), [[3, 4, 0]])[:, 0]
     np.testing.assert_allclose(mph.triangulate(pair(0.5), [0, 1], pixels), [3, 4, 0], atol=1e-9)
     refused(lambda: mph.fit_marker(pair(0.5), [0, 1], pixels), "nearly parallel", "200 mm from a source")
     fit = mph.fit_marker(pair(0.5), [0, 1], pixels, 0.01)
     # Depth z from the disparity d: dz = z^2 / (f b) dd, with f b = 400 px mm * 0.5 and dd = 0.01 sqrt(2) px.
     np.testing.assert_allclose(fit.standard_deviations[2], 200**2 / (400 * 0.5) * 0.01 * np.sqrt(2), rtol=1e-6)
-    near = np.array([pair(1e-5).sources, pair(1e-5).detector_centers])
-    views = mph.Views(near[0], near[1], [[1, 0, 0]] * 2, [[0, 1, 0]] * 2, (256, 256))
-    refused(lambda: mph.triangulate(views, [0, 1], mph.project_points(views, [[3, 4, 0]])[:, 0]), "parallel")

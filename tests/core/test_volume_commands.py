@@ -93,7 +93,7 @@ def test_meshes_in_and_out(tmp_path, ct, capsys):
     assert "--value: expected one number, or one for each of 2 meshes" in capsys.readouterr().err
 
 
-def test_project_converts_and_centers_a_ct(tmp_path, ct, workbook, scanner, capsys):
+def test_project_converts_and_centers_a_ct(tmp_path, ct, workbook, scanner, capsys, monkeypatch):
     common = ("project", workbook, "--modules", "1", "--size", 9, 9, "--backend", "numpy")
     ct_file, out = tmp_path / "ct.nrrd", tmp_path / "run.h5"
     assert run(*common, "--volume", ct_file, "--center", "--energy", "Tc-99m", "-o", out) == 0
@@ -115,25 +115,17 @@ def test_project_converts_and_centers_a_ct(tmp_path, ct, workbook, scanner, caps
     expected = mph.project_run(system, mph.centered(activity), shape=(9, 9), backend="numpy", model=model).projections
     assert np.allclose(counts, expected, rtol=1e-5)
 
+    monkeypatch.chdir(tmp_path)
     for arguments, message in (
-        (
-            ("--volume", tmp_path / "a.nrrd", "--emission", "--mu", ct_file),
-            "give the energy (--energy) to convert them",
-        ),
-        (
-            ("--volume", tmp_path / "a.nrrd", "--energy", "80"),
-            "it holds activity; an energy (--energy) is for CT numbers",
-        ),
-        (("--volume", ct_file, "--emission"), "ct.nrrd: it holds hu, expected activity in kBq/mL"),
-        (("--volume", tmp_path / "a.nrrd", "--photons", "100"), "a.nrrd: it holds activity, expected mu in 1/mm"),
-        (
-            ("--volume", tmp_path / "a.nrrd", "--emission", "--mu", tmp_path / "a.nrrd"),
-            "it holds activity, expected mu",
-        ),
-        (("--energy", "80"), "(--energy) needs volume.file (--volume)"),
-        (("--center",), "(--center) needs volume.file (--volume)"),
+        ("--volume a.nrrd --emission --mu ct.nrrd", "give the energy (--energy) to convert them"),
+        ("--volume a.nrrd --energy 80", "it holds activity; an energy (--energy) is for CT numbers"),
+        ("--volume ct.nrrd --emission", "ct.nrrd: it holds hu, expected activity in kBq/mL"),
+        ("--volume a.nrrd --photons 100", "a.nrrd: it holds activity, expected mu in 1/mm"),
+        ("--volume a.nrrd --emission --mu a.nrrd", "it holds activity, expected mu"),
+        ("--energy 80", "(--energy) needs volume.file (--volume)"),
+        ("--center", "(--center) needs volume.file (--volume)"),
     ):
-        assert run(*common, *arguments, "-o", out) == 1
+        assert run(*common, *arguments.split(), "-o", out) == 1
         assert message in capsys.readouterr().err
 
 
@@ -165,10 +157,10 @@ def test_project_takes_one_series_of_a_dicom_folder(tmp_path, ct, workbook, scan
     assert "only folders of DICOM files hold several series" in capsys.readouterr().err
 
     # A reconstructed tomogram of one file beside them, as activity.
-    write_tomogram(mph.Volume(2 * activity.array + 1, activity.grid), tmp_path / "recon.dcm")
+    tomogram = mph.Volume(2 * activity.array + 1, activity.grid)
+    write_tomogram(tomogram, tmp_path / "recon.dcm")
     assert run(*common, "--volume", tmp_path / "recon.dcm", "--emission", "-o", out) == 0
-    counts = mph.project_run(
-        system, mph.centered(mph.Volume(2 * activity.array + 1, activity.grid)), shape=(9, 9), backend="numpy",
-        model=mph.Emission(system),
-    ).projections  # fmt: skip
-    np.testing.assert_allclose(mph.read_run(out).projections, counts, rtol=1e-6)
+    expected = mph.project_run(
+        system, mph.centered(tomogram), shape=(9, 9), backend="numpy", model=mph.Emission(system)
+    )
+    np.testing.assert_allclose(mph.read_run(out).projections, expected.projections, rtol=1e-6)

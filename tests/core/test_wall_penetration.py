@@ -11,7 +11,6 @@ import pytest
 import mphdrr.core as mph
 from mphdrr.core.geometry.collimator import Collimator, Construction
 from mphdrr.core.models.wall_penetration import models_with_walls
-from mphdrr.core.physics.aperture import disk_points
 
 from .conftest import WORKBOOK, refused
 
@@ -38,13 +37,6 @@ def beside_and_through(system, **more):
     return [next(part for part in parts if part.holes[0] == hole) for hole in (0, 1)]
 
 
-def seen_through_neighbour(system):
-    """A place that the first crystal sees through the second module's hole."""
-    (u, _, k), q = system.frames()[0], system.centers[1]
-    pixel = system.centers[0] - LENGTH * k + 0.3 * SIDE * u * np.sign((q - system.centers[0]) @ u)
-    return q + 1.5 * (q - pixel)
-
-
 def counted(system, model, place, size, pixels=32, n=1):
     """Of one decay a second in a cube the first module's counts."""
     grid = mph.Grid.centered((n, n, n), size / n, place)
@@ -63,30 +55,6 @@ def test_walls_that_stop_all_leave_every_count_as_it_is(rng):
     np.testing.assert_array_equal(images(wall_thickness=500.0), plain)
     leaky = images(wall_thickness=WALL)
     assert (leaky >= plain).all() and leaky.sum() > 1.01 * plain.sum()
-
-
-def test_through_a_neighbour_a_point_is_seen_as_solid_angle_times_walls():
-    """Each point of its hole: the line through it leaves one wall and enters the other."""
-    system, mu = two_modules(), 0.4
-    place = seen_through_neighbour(system)
-    _, through = beside_and_through(system, pixel_points=89, aperture_points=150, aperture_mu=mu)
-    squared, factors, (front, channel) = 16 + 2 * 4 / mu, [], profile(4.0)  # d (d + 2 / mu)
-    for point in disk_points(300) * math.sqrt(squared) / 2:
-        q, path = system.centers[1] + point @ system.frames()[1, :2], 0.0
-        away = place - q
-        line = -away / np.linalg.norm(away)
-        for m in (0, 1):
-            u, _, k = system.frames()[m]
-            u = u * np.sign((system.centers[1 - m] - system.centers[m]) @ u)
-            at, depth = (q - system.centers[m]) @ u, -(q - system.centers[m]) @ k
-            outside = front, -1.0, (SIDE / 2 + WALL - front) / (LENGTH + 1)
-            inside = channel, 1.0, (SIDE / 2 - channel) / (LENGTH - 1)
-            enter, leave = (
-                (half + rise * (depth - s) - at) / (line @ u + rise * (line @ k)) for half, s, rise in (outside, inside)
-            )
-            path += abs(max(leave, (depth - 1) / (line @ k)) - enter)  # walls begin 1 mm behind the hole
-        factors.append(-(line @ system.frames()[1, 2]) / (away @ away) * math.exp(-mu * path))
-    assert counted(system, through, place, 0.5, 64) == pytest.approx(squared / 16 * np.mean(factors), rel=0.01)
 
 
 def traced(system, place, size, points, areas, of_hole, rng):
@@ -128,7 +96,10 @@ def traced(system, place, size, points, areas, of_hole, rng):
 
 def test_photons_one_by_one_through_a_neighbours_hole(rng):
     system, size, n = two_modules(), 6.0, 2**20
-    place, (_, through) = seen_through_neighbour(system), beside_and_through(system)
+    _, through = beside_and_through(system)
+    (u, _, k), q = system.frames()[0], system.centers[1]
+    pixel = system.centers[0] - LENGTH * k + 0.3 * SIDE * u * np.sign((q - system.centers[0]) @ u)
+    place = q + 1.5 * (q - pixel)  # the first crystal sees it through the second module's hole
     radius, (u, v, _) = through.scanner.effective_diameter[1] / 2, system.frames()[1]
     angle, r = 2 * math.pi * rng.random(n), radius * np.sqrt(rng.random(n))
     points = system.centers[1] + (r * np.cos(angle))[:, None] * u + (r * np.sin(angle))[:, None] * v

@@ -8,15 +8,14 @@ import numpy as np
 
 import mphdrr.core as mph
 
+from .test_emission import one_module
+
 _STEPS = 48  # through half a plate
 
 
-def module(d=2.3, l=60.0, side=50.0, thickness=10.0, distance=200.0):
-    """One module that looks along -x."""
-    return mph.PinholeSystem(
-        centers=[[distance, 0.0, 0.0]], roi_radius=60.0, pinhole_diameter=d, collimator_length=l, detector_side=side,
-        detector_thickness=thickness,
-    )  # fmt: skip
+def module(**changes):
+    """Return one module with a hole of 2.3 mm that looks along -x."""
+    return one_module(**{"pinhole_diameter": 2.3, **changes})
 
 
 def voxel(system, place, size):

@@ -23,7 +23,7 @@ from mphdrr.core.rays.backends import reference
 from mphdrr.core.rays.backends.cpu import _fans
 from mphdrr.core.rays.ray_geometry import Attenuation, IndexFans, IndexRays
 
-from .jobs import Made, Read, close, packed
+from .jobs import BAD, Made, Read, close, packed
 from .places_jobs import places_jobs
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -86,10 +86,9 @@ def hostile(rng: np.random.Generator, starts: Array, ends: Array, shape: tuple[i
             if rng.random() < 0.5:
                 ends[i] += ends[i] - starts[i]
         else:
-            bad = [np.nan, np.inf, -np.inf, 1e300, -1e300, 5e-324, -1e-310, 0.0, -0.0, 1e30, 2.0**31, -(2.0**63)]
-            (starts if rng.random() < 0.5 else ends)[i, a] = rng.choice(bad)
+            (starts if rng.random() < 0.5 else ends)[i, a] = rng.choice(BAD)
             if rng.random() < 0.3:
-                starts[i, b], ends[i, b] = rng.choice(bad, 2)
+                starts[i, b], ends[i, b] = rng.choice(BAD, 2)
     return changed
 
 

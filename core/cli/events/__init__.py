@@ -1,7 +1,7 @@
 """Command ``mphdrr events ACTION``: actions on sets of training events, such as ``make``, ``check`` and ``export``.
 
-An action is a module here with ``add_parser(actions)``, named in the list below. The function that runs it has the action's
-help, with its examples, as docstring; `make.run_with_reports` is the loop of the actions that make events.
+An action is a module here with ``add_parser(actions)``, named in the list below. The function that runs it has the
+action's help, with its examples, as docstring; `make.run_with_reports` is the loop of the actions that make events.
 """
 
 from ..options import add_actions

@@ -6,8 +6,7 @@ from dataclasses import asdict
 
 from ... import events
 from ...errors import InputError
-from ..options import count_text, print_answer, progress_bar, say
-from .action import add_action
+from ..options import add_set_action, count_text, print_answer, progress_bar, say
 from .make import run_with_reports
 
 _MAX_CHECKS, _CHECK_INTERVAL = 10, 0.5
@@ -16,7 +15,7 @@ _MAX_CHECKS, _CHECK_INTERVAL = 10, 0.5
 
 def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
     """Add the action ``events check``."""
-    parser = add_action(actions, "check", _run)
+    parser = add_set_action(actions, "check", _run)
     text = "make missing and damaged events anew; foreign files move to the folder SET-foreign; the rest is not touched"
     parser.add_argument("--repair", action="store_true", help=text)
     parser.add_argument("--workers", type=int, default=1, metavar="N", help="processes that make events anew")

@@ -4,13 +4,12 @@ import argparse
 
 from ... import events
 from ...events.programs import PROGRAMS
-from ..options import print_answer, progress_bar, say
-from .action import add_action
+from ..options import add_set_action, print_answer, progress_bar, say
 
 
 def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
     """Add the action ``events export``."""
-    parser = add_action(actions, "export", _run)
+    parser = add_set_action(actions, "export", _run)
     add = parser.add_argument
     add("--to", required=True, choices=PROGRAMS, metavar="PROGRAM", help="see the list below")
     folder = "a new folder, or one with an interrupted export of the same kind, which is resumed"

@@ -12,8 +12,7 @@ from typing import TYPE_CHECKING
 from ... import events
 from ...errors import InputError
 from ...memory import readable_size
-from ..options import print_answer, progress_bar, say
-from .action import add_action
+from ..options import add_set_action, print_answer, progress_bar, say
 
 if TYPE_CHECKING:
     from ...events.work import Making
@@ -21,7 +20,7 @@ if TYPE_CHECKING:
 
 def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
     """Add the action ``events make``."""
-    parser = add_action(actions, "make", _run)
+    parser = add_set_action(actions, "make", _run)
     add = parser.add_argument
     add("--recipe", metavar="FILE", help="recipe (.toml) of a new set, whose folder keeps a copy")
     add("-n", "--count", type=int, metavar="N", help="number of events; default: as in the call before")

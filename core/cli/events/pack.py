@@ -4,8 +4,7 @@ import argparse
 from typing import TYPE_CHECKING
 
 from ...validation import positive
-from ..options import count_text, print_answer, progress_bar
-from .action import add_action
+from ..options import add_set_action, count_text, print_answer, progress_bar
 
 if TYPE_CHECKING:
     from ...events.folders import SetFolder
@@ -13,9 +12,9 @@ if TYPE_CHECKING:
 
 def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
     """Add the actions ``events pack`` and ``events unpack``."""
-    pack = add_action(actions, "pack", _pack)
+    pack = add_set_action(actions, "pack", _pack)
     pack.add_argument("--gigabytes", type=float, default=1.0, metavar="N", help="approximate size of a shard")
-    add_action(actions, "unpack", _unpack)
+    add_set_action(actions, "unpack", _unpack)
 
 
 def _pack(arguments: argparse.Namespace) -> None:

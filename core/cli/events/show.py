@@ -10,8 +10,7 @@ from typing import Any
 from ... import events
 from ...errors import InputError
 from ...figures.page import SUFFIXES
-from ..options import output_path, print_answer
-from .action import add_action
+from ..options import add_set_action, output_path, print_answer
 
 _EVENTS_PER_SHEET = 4
 """Default number of events on a sheet."""
@@ -20,7 +19,7 @@ _COLUMNS = ("x_mm", "y_mm", "z_mm", "phi_degrees", "theta_degrees", "psi_degrees
 
 def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
     """Add the action ``events show``."""
-    parser = add_action(actions, "show", _run)
+    parser = add_set_action(actions, "show", _run)
     add = parser.add_argument
     text = f"numbers of the events; default: the first {_EVENTS_PER_SHEET} for a sheet, all for a list"
     add("--events", type=int, nargs="+", metavar="I", help=text)

@@ -6,13 +6,12 @@ from dataclasses import asdict
 from ... import events
 from ...errors import number_ranges
 from ...memory import readable_size
-from ..options import count_text, print_answer
-from .action import add_action
+from ..options import add_set_action, count_text, print_answer
 
 
 def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
     """Add the action ``events status``."""
-    add_action(actions, "status", _run)
+    add_set_action(actions, "status", _run)
 
 
 def _run(arguments: argparse.Namespace) -> None:

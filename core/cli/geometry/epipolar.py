@@ -143,7 +143,7 @@ def _depth_range(depths: list[float] | None, system: Scanner, m: int) -> tuple[f
     """Return the depths, mm from the pinhole, between which a ray is shown: as typed, else across the ROI of module `m`."""
     if depths is None:
         distance = float(np.linalg.norm(system.poses()[m, :3, 3]))
-        radius = float(system.roi_radius[m]) if isinstance(system, mph.PinholeSystem) else system.region_radius()
+        radius = float(system.roi_radii()[m])
         return max(distance - radius, 0.0), distance + radius
     if len(depths) > 2:
         raise mph.InputError(f"--depth: expected one depth or two, got {len(depths)}")

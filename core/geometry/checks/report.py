@@ -5,8 +5,8 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from ..collimator import EdgePlace
-from ..finding import Finding
 from ..part_colors import PartKind
+from ..scanner import Finding
 
 
 @dataclass(frozen=True)

@@ -8,19 +8,20 @@ from pathlib import Path
 from typing import Any
 
 from ...errors import InputError, naming
-from ...events.entries import by_key, check_entries, flat, grid_of, like, plain_name, required, table
 from ...events.event_set import EventSet
 from ...files import AnyPath
 from ...geometry.grid import Grid
-from ...runs.recipe import Values
-from ...runs.settings import Setting, named
-from ...toml import read_toml
+from ...recipes.settings import Setting, settings_by_key, table_names, word_labels
+from ...recipes.tables import check_entries, flat_entries, read_table, require_name, require_value, table_entries
+from ...recipes.toml import read_toml
+from ...recipes.values import Values
+from ...runs.settings import SETTINGS
 from .methods import Family
 from .scoring import SCORINGS
 
 VERSION = 1
 
-_TEST = by_key((
+_TEST = settings_by_key((
     Setting("events", str, None, "Folder of the set", is_path=True),
     Setting("split", str, None, "Split of the set that is used", "all events"),
     Setting("model", str, "emission", "Model of the set whose images are used"),
@@ -28,7 +29,7 @@ _TEST = by_key((
     Setting("name", str, None, "Name in the table"),
     Setting("models", str, None, "Names of the models that are judged on this test", "all", sizes=()),
     Setting("scoring", str, "volumes", "Scores besides those of the voxels",
-            words=named(SCORINGS)),
+            words=word_labels(SCORINGS)),
     Setting("levels", float, (1.0,), "Shares of the acquisition time", above=0, sizes=()),
     Setting("believed", str, None, "Workbook of the geometry that methods are told", "that of the images",
             is_path=True),
@@ -38,10 +39,10 @@ _TEST = by_key((
     Setting("drawn_events", int, 3, "Number of events, the first ones, for bias and deviation", least=1),
     Setting("channel_width", float, 30.0, "Width of the observer's channels", unit="mm", above=0),
 ))  # fmt: skip
-_ROWS = by_key((
-    like("grid.voxels", "phantom.voxels"),
-    like("grid.spacing", "phantom.spacing"),
-    like("grid.center", "phantom.position", text="Centre of the volumes, x y z"),
+_ROWS = settings_by_key((
+    SETTINGS["phantom.voxels"].with_key("grid.voxels"),
+    SETTINGS["phantom.spacing"].with_key("grid.spacing"),
+    SETTINGS["phantom.position"].with_key("grid.center", text="Centre of the volumes, x y z"),
     Setting("baselines.subsets", int, 10, "Number of subsets of OSEM and BSREM", least=1),
     Setting("baselines.stops", int, (2, 4, 8, 12, 16, 24), "Iterations of OSEM to choose from", least=1, sizes=()),
     Setting("baselines.fwhm", float, (0.0, 2.4, 3.6, 4.8, 6.5, 8.0, 10.0), "Widths of the filter after OSEM to choose from",
@@ -49,10 +50,11 @@ _ROWS = by_key((
     Setting("baselines.iterations", int, 15, "Iterations of BSREM", least=1),
     Setting("baselines.weights", float, (0.0003, 0.001, 0.003, 0.01, 0.03, 0.1), "Weights of BSREM's prior, of relative "
             "differences, to choose from", above=0, sizes=()),
-    Setting("baselines.families", str, ("osem", "bsrem"), "Families of baselines", words=named(("osem", "bsrem")), sizes=()),
+    Setting("baselines.families", str, ("osem", "bsrem"), "Families of baselines", words=word_labels(("osem", "bsrem")),
+            sizes=()),
     Setting("judge.seed", int, 0, "Seed of the bootstrap", least=0),
 ))  # fmt: skip
-_TABLES = ("grid", "baselines", "judge")
+_TABLES = table_names(_ROWS)
 
 
 class Test(Values):
@@ -87,7 +89,7 @@ class JudgeRecipe(Values):
     @cached_property
     def grid(self) -> Grid:
         """Voxels that all methods return."""
-        return grid_of(self, "grid")
+        return self.table_grid("grid")
 
     @cached_property
     def tests(self) -> list[Test]:
@@ -96,7 +98,7 @@ class JudgeRecipe(Values):
         if not isinstance(entries, list) or not entries or not all(isinstance(entry, dict) for entry in entries):
             raise InputError("tests: expected one [[tests]] or more")
         tests = [self._test(entry, f"tests: {entry.get('name', number)}") for number, entry in enumerate(entries, 1)]
-        names = [plain_name(test["name"], "tests: name") for test in tests]
+        names = [require_name(test["name"], "tests: name") for test in tests]
         if len(set(names)) < len(names):
             raise InputError(f"tests: expected different names, got {', '.join(names)}")
         return tests
@@ -104,12 +106,12 @@ class JudgeRecipe(Values):
     @cached_property
     def validation(self) -> Test:
         """Events on which baselines are tuned."""
-        return self._test({"name": "validation", **table(self.values, "validation")}, "validation")
+        return self._test({"name": "validation", **read_table(self.values, "validation")}, "validation")
 
     @cached_property
     def models(self) -> dict[str, Path]:
         """Paths of the models' files by their names in the table."""
-        models = table(self.values, "models")
+        models = read_table(self.values, "models")
         for name, file in models.items():
             if not isinstance(file, str) or not file:
                 raise InputError(f"models.{name}: expected a file's name, got {file!r}")
@@ -135,8 +137,8 @@ class JudgeRecipe(Values):
     def _test(self, entry: dict[str, Any], name: str) -> Test:
         """Return a test from its table; errors are headed by `name`."""
         with naming(name):
-            test = Test(flat(entry, _TEST))
-            required(test["events"], "events", "name the folder of the set")
+            test = Test(flat_entries(entry, _TEST))
+            require_value(test["events"], "events", "name the folder of the set")
             return test
 
 
@@ -148,5 +150,4 @@ def read_judge_recipe(path: AnyPath) -> JudgeRecipe:
     with naming(path):
         values = read_toml(path)
         check_entries(values, VERSION, ("version", "tests", "models", "validation", *_TABLES))
-        settings = flat({name: table(values, name) for name in _TABLES}, _ROWS, *_TABLES)
-        return JudgeRecipe(settings, values, Path(path).absolute().parent)
+        return JudgeRecipe(table_entries(values, _ROWS), values, Path(path).absolute().parent)

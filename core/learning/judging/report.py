@@ -9,6 +9,7 @@ import numpy as np
 from ...figures.page import Page
 from ...figures.parts import FAINT, INK, Axes, heading, number
 from ...files import write_bytes
+from ...reconstruction.scores.summary import JUDGED_SCORES
 from ...runs.display import Display
 from ...volumes.volume import Volume
 from .records import write_json
@@ -22,7 +23,7 @@ _COLUMNS = (
     ("NRMSE", "nrmse", "{:.3f}"),
     ("by the best baseline", "best_baseline", "{[ratio]}"),
     ("by the best tuned on the set", "best_on_itself", "{[ratio]}"),
-    ("SSIM", "ssim", "{:.3f}"),
+    *((row.label, row.name, f"{{:{row.form}}}") for row in JUDGED_SCORES),
     ("bias", "bias", "{:.3f}"),
     ("SD", "deviation", "{:.3f}"),
     ("contrast", "contrast", "{:.2f}"),

@@ -20,8 +20,9 @@ from ...geometry.scanner import Scanner
 from ...phantoms.derenzo import DerenzoPhantom
 from ...phantoms.torso import CardiacTorso
 from ...projector import Projector
-from ...reconstruction.scores.images import nrmse, ssim
-from ...runs.reconstructing import model_of
+from ...reconstruction.scores.images import nrmse
+from ...reconstruction.scores.summary import JUDGED_SCORES
+from ...runs.reconstructing import reconstruction_model
 from ...runs.run import ProjectionRun
 from ...runs.run_recipe import projector_of_run, recipe_views
 from ...volumes.resampling import resample
@@ -75,7 +76,7 @@ class Case:
     @cached_property
     def projector(self) -> Projector:
         """Projector from the judge's grid to the run's images, with the model that made them."""
-        return projector_of_run(self.run, self.grid, recipe=model_of(self.run, self.run.recipe))
+        return projector_of_run(self.run, self.grid, recipe=reconstruction_model(self.run, self.run.recipe))
 
     def score(self, volume: Volume, scoring: str) -> Scores:
         """Return the scores of a volume in a test of this kind (`SCORINGS`)."""
@@ -84,8 +85,9 @@ class Case:
         A = self.projector
         deviance = relative_deviance(self.run.projections, A(volume.array) + A.background)
         scores: Scores = {"nrmse": nrmse(volume, self.truth), "deviance": deviance}
-        if min(self.grid.shape) >= 11:  # the window's side
-            scores["ssim"] = ssim(volume, self.truth)
+        for row in JUDGED_SCORES:
+            if min(self.grid.shape) >= row.judged_from:
+                scores[row.name] = row.function(volume, self.truth)
         return scores | SCORINGS[scoring](volume, self)
 
     def contrasts(self, volume: Volume, phantom: DerenzoPhantom, rods: Any) -> Any:

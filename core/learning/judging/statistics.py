@@ -27,23 +27,27 @@ class Estimate(NamedTuple):
         return f"{self.value:.3f} [{self.low:.3f}, {self.high:.3f}]"
 
 
-def ratio_of_means(values: ArrayLike, others: ArrayLike, seed: int = 0) -> Estimate:
-    """Return the mean of `values` divided by that of `others`, both (n,) of the same events, with its interval.
+def ratio_of_means(values: ArrayLike, references: ArrayLike, seed: int = 0) -> Estimate:
+    """Return the mean of `values` divided by the mean of `references`, both (n,) of the same events, with its interval.
 
     The interval is that of a paired bootstrap by percentiles (Efron, Tibshirani 1993, An Introduction to the Bootstrap,
     chapter 13). The same seed gives the same interval.
     """
-    return _bootstrap(values, others, np.divide, seed)
+    return _bootstrap(values, references, np.divide, seed)
 
 
-def difference_of_means(values: ArrayLike, others: ArrayLike, seed: int = 0) -> Estimate:
-    """Return the mean of `values` minus that of `others`, both (n,) of the same events, with a paired bootstrap interval."""
-    return _bootstrap(values, others, np.subtract, seed)
+def difference_of_means(values: ArrayLike, references: ArrayLike, seed: int = 0) -> Estimate:
+    """Return the mean of `values` minus the mean of `references` (n,), with its paired bootstrap interval.
+
+    Both arrays are of the same events in the same order.
+    """
+    return _bootstrap(values, references, np.subtract, seed)
 
 
-def _bootstrap(values: ArrayLike, others: ArrayLike, compare: Callable[..., Floats], seed: int) -> Estimate:
-    """Return a comparison of two means with its paired bootstrap interval."""
-    pairs = np.stack([real_array(values, "values", (None,)), real_array(others, "other values", (np.size(values),))])
+def _bootstrap(values: ArrayLike, references: ArrayLike, compare: Callable[..., Floats], seed: int) -> Estimate:
+    """Return the comparison ``compare(mean of values, mean of references)`` with its paired bootstrap interval."""
+    size = np.size(values)
+    pairs = np.stack([real_array(values, "values", (None,)), real_array(references, "other values", (size,))])
     if not pairs.size:
         raise InputError("bootstrap: expected values of one event or more, got none")
     n = pairs.shape[1]

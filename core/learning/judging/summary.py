@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 
 from ...errors import InputError
+from ...reconstruction.scores.summary import JUDGED_SCORES
 from .observer import observe
 from .rods import PRESENT
 from .statistics import difference_of_means, ratio_of_means, wilson
@@ -14,7 +15,7 @@ Rows = Sequence[Mapping[str, Any]]
 
 ENOUGH_EVENTS, ENOUGH_SITES = 50, 200
 """Numbers of events and of sites from which on intervals are reliable; rows with fewer get a note."""
-_MEANS = ("nrmse", "ssim", "contrast", "deviance", "seconds")
+_MEANS = ("nrmse", *(row.name for row in JUDGED_SCORES), "contrast", "deviance", "seconds")
 _DRAWN = ("bias", "deviation")
 
 
@@ -50,16 +51,19 @@ def mean_scores(rows: Rows, drawn: Rows = ()) -> dict[str, Any]:
     return summary
 
 
-def compare_scores(rows: Rows, others: Rows, seed: int) -> dict[str, Any]:
-    """Return paired bootstrap intervals of a method beside another, `others`, on the same events in the same order."""
-    values, other_values = (np.array([row["nrmse"] for row in method_rows]) for method_rows in (rows, others))
-    comparison: dict[str, Any] = {"ratio": ratio_of_means(values, other_values, seed)}
-    values, other_values = (
+def compare_scores(rows: Rows, reference_rows: Rows, seed: int) -> dict[str, Any]:
+    """Return paired bootstrap intervals of a method's scores relative to those of a reference method.
+
+    `rows` and `reference_rows` are the scores of both methods for the same events in the same order.
+    """
+    values, references = (np.array([row["nrmse"] for row in method_rows]) for method_rows in (rows, reference_rows))
+    comparison: dict[str, Any] = {"ratio": ratio_of_means(values, references, seed)}
+    values, references = (
         np.array([float(row["site"] > PRESENT) for row in method_rows if row.get("site_has_rod") is False])
-        for method_rows in (rows, others)
+        for method_rows in (rows, reference_rows)
     )
     if len(values):
-        comparison["false_rods_more"] = difference_of_means(values, other_values, seed)
+        comparison["false_rods_more"] = difference_of_means(values, references, seed)
     return comparison
 
 

@@ -4,9 +4,10 @@ Entry points: `NETWORKS` (the table), `network.Network` (the interface: a networ
 `Sample` and returns volumes), `network.UNet`.
 
 To add a network, write a file with a class derived from `Network` and add a row to `NETWORKS` that names both. The
-arguments of the class, with their defaults, are its settings in recipes; `network.relative_residual` and
-`network.normalized_backprojection` tell a network what the counts say about a volume. Names of submodules are names of
-weights in model files: they stay.
+arguments of the class, with their defaults, are its settings in recipes (whole numbers are 1 or more, except those that
+the class names in `may_be_0`); tests/core/test_networks.py wants small values of them in `SMALL`.
+`network.relative_residual` and `network.normalized_backprojection` tell a network what the counts say about a volume.
+Names of submodules are names of weights in model files: they stay.
 """
 
 from collections.abc import Mapping

@@ -1,7 +1,9 @@
-"""The projector as the operators of other packages, so that their algorithms run on this scanner.
+"""Adapters of the projector to the operators of other packages, whose algorithms so run on this scanner.
 
-The packages are imported when they are asked for. Their operators compute with `Projector` alone: the same numbers, kernels
-and exact adjoint.
+A package is imported when its adapter is called. The adapted operators compute with `Projector` alone: the same numbers,
+kernels and exact adjoint.
+
+To add a package, write a module here that imports it, and a function below that imports the module when it is called.
 """
 
 import importlib
@@ -16,17 +18,17 @@ from .parallelproj_operator import ParallelprojOperator
 
 
 def scipy_operator(A: LinearOperator) -> Any:
-    """`A` as a ``scipy.sparse.linalg.LinearOperator`` on flat arrays, for its ``lsqr``, ``lsmr``, ``svds``, …
+    """Return `A` as a ``scipy.sparse.linalg.LinearOperator`` on flat arrays, for scipy's ``lsqr``, ``lsmr`` or ``svds``.
 
     Parameters
     ----------
     A : Projector or its adjoint
-        From arrays of ``A.shape_in`` to those of ``A.shape_out``.
+        Operator from arrays of ``A.shape_in`` to arrays of ``A.shape_out``.
 
     Returns
     -------
     scipy.sparse.linalg.LinearOperator
-        Its shape is (pixels, voxels), in C order. Several columns go through `A` as one batch.
+        Operator of shape (pixels, voxels), in C order. Several columns go through `A` as one batch.
 
     Raises
     ------
@@ -43,21 +45,22 @@ def scipy_operator(A: LinearOperator) -> Any:
 
 
 def deepinv_physics(A: Projector, **options: Any) -> Any:
-    """`A` as a ``deepinv.physics.LinearPhysics``, for deepinv's algorithms and networks.
+    """Return `A` as a ``deepinv.physics.LinearPhysics``, for deepinv's algorithms and networks.
 
     Parameters
     ----------
     A : Projector
-        From volumes to images.
+        Projector from volumes to images.
     options
         Options of ``LinearPhysics``, such as ``noise_model=deepinv.physics.PoissonNoise()``.
 
     Returns
     -------
     deepinv.physics.LinearPhysics
-        Takes volumes (B, C, n_x, n_y, n_z) and gives images (B, C, M, n_v, n_u), float32 or float64, on any device. Where
-        the model has a background, that is its ``background``, which deepinv's MLEM and OSEM expect in the counts.
-        ``split_physics(n)`` and ``split_measurements(y, n)`` are the balanced subsets of its OSEM, in the order of `osem`.
+        Operator from volumes (B, C, n_x, n_y, n_z) to images (B, C, M, n_v, n_u), float32 or float64, on any device. If the
+        model has a background, the attribute ``background`` holds it, which deepinv's MLEM and OSEM add to the expected
+        counts. ``split_physics(n)`` and ``split_measurements(y, n)`` return the balanced subsets for deepinv's OSEM, in the
+        order of `osem`.
 
     Raises
     ------
@@ -79,18 +82,18 @@ def deepinv_physics(A: Projector, **options: Any) -> Any:
 
 
 def pytomography_matrix(A: Projector) -> Any:
-    """`A` as a PyTomography ``SystemMatrix``, for its OSEM, BSREM and other algorithms.
+    """Return `A` as a PyTomography ``SystemMatrix``, for PyTomography's OSEM, BSREM and other algorithms.
 
     Parameters
     ----------
     A : Projector
-        From volumes to images.
+        Projector from volumes to images.
 
     Returns
     -------
     pytomography.projectors.SystemMatrix
-        Takes objects (n_x, n_y, n_z) and gives projections (M, n_v, n_u); lengths are cm, as PyTomography's. Its subsets are
-        balanced over rings and angles, in the order of `osem`. A background goes to the likelihood:
+        Operator from objects (n_x, n_y, n_z) to projections (M, n_v, n_u); lengths are in cm, as in PyTomography. Its
+        subsets are balanced over rings and angles, in the order of `osem`. A background is an argument of the likelihood:
         ``additive_term=torch.tensor(A.background)``.
 
     Raises
@@ -113,17 +116,17 @@ def pytomography_matrix(A: Projector) -> Any:
 
 
 def parallelproj_operator(A: LinearOperator) -> ParallelprojOperator:
-    """`A` with the methods of a ``parallelproj`` linear operator, for algorithms that are written for these.
+    """Return `A` with the methods of a ``parallelproj`` linear operator, for algorithms that use these methods.
 
     Parameters
     ----------
     A : Projector or its adjoint
-        From arrays of ``A.shape_in`` to those of ``A.shape_out``.
+        Operator from arrays of ``A.shape_in`` to arrays of ``A.shape_out``.
 
     Returns
     -------
     ParallelprojOperator
-        `parallelproj` need not be there; its own operators combine with this one.
+        Operator that can be combined with the operators of `parallelproj`, which need not be installed.
 
     Raises
     ------
@@ -140,6 +143,6 @@ def parallelproj_operator(A: LinearOperator) -> ParallelprojOperator:
 
 
 def _module(name: str, package: str) -> Any:
-    """A module of this folder, which imports the package; `InputError` where that, or something it needs, is missing."""
+    """Import a module of this folder, which needs `package`; raise `InputError` if a package is missing."""
     with needing(feature=package):
         return importlib.import_module(f".{name}", __package__)

@@ -1,4 +1,4 @@
-"""scipy's linear operators."""
+"""Projector as a linear operator of scipy."""
 
 import numpy as np
 from scipy.sparse.linalg import LinearOperator as ScipyLinearOperator
@@ -8,17 +8,17 @@ from ...rays.linear_operator import LinearOperator
 
 
 class ScipyOperator(ScipyLinearOperator):
-    """A projector between flat arrays."""
+    """Projector between flat arrays."""
 
     def __init__(self, A: LinearOperator) -> None:
         self._operator = A
         super().__init__(np.dtype(np.float32), (int(np.prod(A.shape_out)), int(np.prod(A.shape_in))))
 
     def _matmat(self, X: Array) -> Array:
-        return _of_columns(self._operator, X)
+        return _apply_to_columns(self._operator, X)
 
     def _rmatmat(self, X: Array) -> Array:
-        return _of_columns(self._operator.T, X)
+        return _apply_to_columns(self._operator.T, X)
 
     def _matvec(self, x: Array) -> Array:
         return self._matmat(x.reshape(-1, 1))[:, 0]
@@ -27,8 +27,8 @@ class ScipyOperator(ScipyLinearOperator):
         return self._rmatmat(x.reshape(-1, 1))[:, 0]
 
 
-def _of_columns(A: LinearOperator, columns: Array) -> Array:
-    """`A` of each column, as one batch."""
+def _apply_to_columns(A: LinearOperator, columns: Array) -> Array:
+    """Return the matrix whose columns are `A` applied to each of `columns` (n_in, n), computed as one batch."""
     n = columns.shape[1]
     result: Array = A(columns.T.reshape(n, *A.shape_in))
     return result.reshape(n, -1).T

@@ -1,4 +1,4 @@
-"""How far a volume is from the truth, voxel by voxel: errors, similarity, contrast to noise, bias and deviation."""
+"""Image quality scores from voxels: errors, structural similarity, contrast-to-noise ratio, bias and deviation."""
 
 from collections.abc import Iterable
 from typing import Any, NamedTuple
@@ -12,20 +12,22 @@ from ...memory import require
 from ...progress import Progress, in_threads
 from ...validation import instance, positive, real_array, shape_text
 from ...volumes.volume import Volume
-from ..stopping import inside
+from ..stopping import checked_mask
 
 Values = Volume | ArrayLike
 
-_SIGMA, _RADIUS = 1.5, 5  # of the window of Wang et al., voxels
-_K1, _K2 = 0.01, 0.03  # their constants
-_SLAB = 1 << 18  # voxels at once
+_SIGMA, _RADIUS = 1.5, 5  # standard deviation and half-width, voxels, of the SSIM window of Wang et al.
+WINDOW = 2 * _RADIUS + 1
+"""Side of the SSIM window, voxels."""
+_K1, _K2 = 0.01, 0.03  # SSIM constants of Wang et al.
+_SLAB = 1 << 18  # voxels that are computed at once
 
 
 def nrmse(volume: Values, truth: Values, mask: ArrayLike | None = None) -> float:
-    """Normalised root mean square error: rms of volume - truth, by the rms of the truth.
+    """Return the normalised root mean square error ``rms(volume - truth) / rms(truth)``.
 
-    0 for the truth itself, 1 for a volume of zeros. This normalisation, by the truth's Euclidean norm, is one of several in
-    use (Fienup 1997, "Invariant error metrics for image reconstruction", Appl. Opt. 36(32)).
+    It is 0 for the truth itself and 1 for a volume of zeros. The normalisation by the truth's Euclidean norm is one of
+    several in use (Fienup 1997, "Invariant error metrics for image reconstruction", Appl. Opt. 36(32)).
 
     Parameters
     ----------
@@ -33,12 +35,12 @@ def nrmse(volume: Values, truth: Values, mask: ArrayLike | None = None) -> float
         Volumes on the same grid, of the same quantity, or arrays of the same shape. Volumes on different grids are refused:
         bring one to the other's grid first, ``mph.resample(truth, volume.grid, "mean")``.
     mask
-        Booleans of that shape: the voxels that count. Default: all.
+        Booleans of the volume's shape, True in the voxels to compare; by default all voxels.
 
     Raises
     ------
     InputError
-        If the volumes do not fit together, or the truth is 0 everywhere.
+        Grids, shapes or quantities differ, or the truth is 0 everywhere.
     """
     values, true = _pair(volume, truth, "nrmse", mask)
     norm = float(np.sqrt(np.mean(true**2)))
@@ -48,17 +50,17 @@ def nrmse(volume: Values, truth: Values, mask: ArrayLike | None = None) -> float
 
 
 def psnr(volume: Values, truth: Values, data_range: float | None = None, mask: ArrayLike | None = None) -> float:
-    """Peak signal-to-noise ratio, dB: 20 log10(range / rms of volume - truth).
+    """Return the peak signal-to-noise ratio ``20 log10(data_range / rms(volume - truth))``, dB.
 
-    Infinite for the truth itself. (Huynh-Thu, Ghanbari 2008, "Scope of validity of PSNR in image/video quality assessment",
-    Electron. Lett. 44(13).)
+    It is infinite for the truth itself. (Huynh-Thu, Ghanbari 2008, "Scope of validity of PSNR in image/video quality
+    assessment", Electron. Lett. 44(13).)
 
     Parameters
     ----------
     volume, truth, mask
         See `nrmse`.
     data_range
-        Largest minus smallest value that there can be. Default: of the truth.
+        Largest minus smallest possible value; by default largest minus smallest value of the truth.
     """
     values, true = _pair(volume, truth, "psnr", mask)
     span = _span(true, data_range, "psnr")
@@ -67,17 +69,17 @@ def psnr(volume: Values, truth: Values, data_range: float | None = None, mask: A
 
 
 def ssim(volume: Values, truth: Values, data_range: float | None = None, progress: Progress | None = None) -> float:
-    """Structural similarity, in three dimensions: 1 for the truth itself.
+    """Return the structural similarity in three dimensions, 1 for the truth itself.
 
-    The mean of the SSIM index over all places where a window of 11 voxels along each axis fits: a Gaussian of 1.5 voxels,
-    C1 = (0.01 range)^2 and C2 = (0.03 range)^2, as in Wang et al. 2004, "Image quality assessment: from error visibility to
-    structural similarity", IEEE Trans. Image Process. 13(4). An axis of one voxel is left out: a slice has its SSIM in two
-    dimensions. The same for both orders of volume and truth, if `data_range` is given.
+    It is the mean of the SSIM index over all positions at which a window of 11 voxels along each axis fits, with a Gaussian
+    of 1.5 voxels, C1 = (0.01 range)^2 and C2 = (0.03 range)^2, as in Wang et al. 2004, "Image quality assessment: from error
+    visibility to structural similarity", IEEE Trans. Image Process. 13(4). An axis of one voxel is left out, so that a slice
+    has its SSIM in two dimensions. With `data_range` set, the result is symmetric in volume and truth.
 
     Parameters
     ----------
     volume, truth
-        See `nrmse`; with one voxel or at least 11 along each axis.
+        See `nrmse`; each axis must have one voxel or at least 11.
     data_range
         See `psnr`.
     progress
@@ -86,8 +88,8 @@ def ssim(volume: Values, truth: Values, data_range: float | None = None, progres
     values, true = _pair(volume, truth, "ssim")
     span = _span(true, data_range, "ssim")
     shape = tuple(n for n in values.shape if n > 1)
-    if not shape or min(shape) < 2 * _RADIUS + 1:
-        text = f"one or at least {2 * _RADIUS + 1} voxels along each axis"
+    if not shape or min(shape) < WINDOW:
+        text = f"one or at least {WINDOW} voxels along each axis"
         raise InputError(f"ssim: expected {text}, got {shape_text(values.shape)}")
     values, true = values.reshape(shape), true.reshape(shape)
     c1, c2 = (_K1 * span) ** 2, (_K2 * span) ** 2
@@ -108,48 +110,52 @@ def ssim(volume: Values, truth: Values, data_range: float | None = None, progres
 
 
 def contrast_to_noise(volume: Values, target: ArrayLike, background: ArrayLike) -> float:
-    """Contrast-to-noise ratio: mean of the target minus mean of the background, by the background's standard deviation.
+    """Return the contrast-to-noise ratio: target mean minus background mean, by the background's standard deviation.
 
-    Negative for a target colder than its background; infinite if the background is the same everywhere and the target is
-    not. (Cherry, Sorenson, Phelps 2012, Physics in Nuclear Medicine, 4th edition, chapter 15.)
+    It is negative for a target colder than its background, and infinite if the background is uniform and the target has
+    another value. (Cherry, Sorenson, Phelps 2012, Physics in Nuclear Medicine, 4th edition, chapter 15.)
 
     Parameters
     ----------
     volume
-        A volume, or an array.
+        Volume, or array of its values.
     target, background
-        Booleans of its shape: the voxels of each; at least two of the background.
+        Booleans of the volume's shape, True in the voxels of the region; at least two voxels in the background.
     """
     values = _values(volume, "contrast_to_noise")
-    target_values, around = (
-        values[_mask(mask, values.shape, f"contrast_to_noise: {name}", least)]
-        for mask, name, least in ((target, "target", 1), (background, "background", 2))
+    target_values, background_values = (
+        values[_mask(mask, values.shape, f"contrast_to_noise: {name}", smallest)]
+        for mask, name, smallest in ((target, "target", 1), (background, "background", 2))
     )
-    contrast, noise = float(target_values.mean() - around.mean()), float(around.std(ddof=1))
+    contrast = float(target_values.mean() - background_values.mean())
+    noise = float(background_values.std(ddof=1))
     if not noise:
         return float(np.copysign(np.inf, contrast)) if contrast else 0.0
     return contrast / noise
 
 
 class BiasAndDeviation(NamedTuple):
-    """What `bias_and_deviation` gives."""
+    """Bias and standard deviation of reconstructions in each voxel."""
 
     bias: Volume
+    """Mean of the reconstructions minus the truth."""
     deviation: Volume
+    """Sample standard deviation (n - 1) of the reconstructions."""
 
 
 def bias_and_deviation(volumes: Iterable[Volume], truth: Volume) -> BiasAndDeviation:
-    """Bias and standard deviation of reconstructions of several noise draws of the same counts, in each voxel.
+    """Compute bias and standard deviation, in each voxel, of reconstructions from several noise draws of the same counts.
 
-    The bias is the mean of the draws minus the truth, the deviation the sample standard deviation (n - 1). The mean square
+    The bias is the mean over the draws minus the truth, the deviation the sample standard deviation (n - 1). The mean square
     error of n draws is the bias squared plus (n - 1) / n times the deviation squared (Barrett, Myers 2004, Foundations of
     Image Science, chapter 14).
 
     Parameters
     ----------
     volumes
-        Two or more on the truth's grid, of its quantity; they are taken one after the other, so a generator will do.
+        Two or more volumes of the truth's grid and quantity; an iterator is allowed, as only one is held at a time.
     truth
+        True volume, whose counts the noise was drawn for.
 
     Returns
     -------
@@ -160,20 +166,23 @@ def bias_and_deviation(volumes: Iterable[Volume], truth: Volume) -> BiasAndDevia
     if isinstance(volumes, Volume):
         raise InputError("bias_and_deviation: expected two volumes or more, got one")
     mean, squares, count = np.zeros(truth.grid.shape), np.zeros(truth.grid.shape), 0
-    for count, volume in enumerate(volumes, 1):  # Welford's recurrence: nothing cancels
+    for count, volume in enumerate(volumes, 1):  # Welford's recurrence, which avoids cancellation
         instance(volume, Volume, f"bias_and_deviation: volume {count}")
         _require_fit(volume, truth, f"bias_and_deviation: volume {count}")
-        apart = volume.array - mean
-        mean += apart / count
-        squares += apart * (volume.array - mean)
+        difference = volume.array - mean
+        mean += difference / count
+        squares += difference * (volume.array - mean)
     if count < 2:
         raise InputError(f"bias_and_deviation: expected two volumes or more, got {count}")
-    found = (mean - truth.array, np.sqrt(squares / (count - 1)))
-    return BiasAndDeviation(*(Volume(values.astype(np.float32), truth.grid, truth.quantity) for values in found))
+    results = (mean - truth.array, np.sqrt(squares / (count - 1)))
+    return BiasAndDeviation(*(Volume(values.astype(np.float32), truth.grid, truth.quantity) for values in results))
 
 
 def _pair(volume: Values, truth: Values, name: str, mask: ArrayLike | None = None) -> tuple[Floats, Floats]:
-    """The values of both, float64, checked to belong to the same voxels; those of the mask, if there is one."""
+    """Return the values of volume and truth as float64, those inside `mask` as (n,) if there is one.
+
+    Raise `InputError` unless grids, quantities and shapes agree; `name` is the scoring function in messages.
+    """
     if isinstance(volume, Volume) and isinstance(truth, Volume):
         _require_fit(volume, truth, name)
     values, true = _values(volume, name), _values(truth, f"{name}: truth")
@@ -183,11 +192,12 @@ def _pair(volume: Values, truth: Values, name: str, mask: ArrayLike | None = Non
         raise InputError(f"{name}: the volume has no voxels")
     if mask is None:
         return values, true
-    which = _mask(mask, values.shape, f"{name}: mask", 1)
-    return values[which], true[which]
+    inside = _mask(mask, values.shape, f"{name}: mask", 1)
+    return values[inside], true[inside]
 
 
 def _values(volume: Values, name: str) -> Floats:
+    """Return the values of a volume or array as float64; raise an error if the memory is too small."""
     if isinstance(volume, Volume):
         require(8.0 * volume.grid.n_voxels, f"{name} of {shape_text(volume.grid.shape)} voxels")
         return volume.array.astype(np.float64)
@@ -195,7 +205,7 @@ def _values(volume: Values, name: str) -> Floats:
 
 
 def _require_fit(volume: Volume, truth: Volume, name: str) -> None:
-    """Raise `InputError` unless both hold the same quantity on the same grid."""
+    """Raise `InputError` unless volume and truth hold the same quantity on the same grid."""
     if volume.quantity != truth.quantity:
         raise InputError(f"{name}: volume of {volume.quantity}, truth of {truth.quantity}")
     if not same_grid(volume.grid, truth.grid):
@@ -203,24 +213,26 @@ def _require_fit(volume: Volume, truth: Volume, name: str) -> None:
         raise InputError(f"{name}: volume and truth are on different grids; {advice}")
 
 
-def _mask(mask: ArrayLike, shape: tuple[int, ...], name: str, least: int) -> Bools:
-    found = inside(mask, name, shape)
-    if np.count_nonzero(found) < least:
-        raise InputError(f"{name}: expected at least {least} voxels, got {np.count_nonzero(found)}")
-    return found
+def _mask(mask: ArrayLike, shape: tuple[int, ...], name: str, smallest: int) -> Bools:
+    """Return `mask` as booleans; raise `InputError` unless it has this shape and at least `smallest` voxels."""
+    array = checked_mask(mask, name, shape)
+    if np.count_nonzero(array) < smallest:
+        raise InputError(f"{name}: expected at least {smallest} voxels, got {np.count_nonzero(array)}")
+    return array
 
 
 def _span(true: Floats, data_range: Any, name: str) -> float:
+    """Return `data_range`, or by default largest minus smallest value of the truth; raise `InputError` if that is 0."""
     if data_range is not None:
         return positive(data_range, f"{name}: data_range")
     span = float(true.max() - true.min())
     if not span:
-        raise InputError(f"{name}: the truth is the same everywhere; data_range says what range its values have")
+        raise InputError(f"{name}: the truth is the same everywhere; set data_range to the range of values")
     return span
 
 
 def _windowed(values: Floats) -> Floats:
-    """Means under the Gaussian window, where it fits."""
+    """Return means weighted with the Gaussian window, at the positions where the window fits."""
     weights = np.exp(-0.5 * (np.arange(-_RADIUS, _RADIUS + 1) / _SIGMA) ** 2)
     weights /= weights.sum()
     for axis in range(values.ndim):

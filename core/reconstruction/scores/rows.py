@@ -1,6 +1,7 @@
-"""A score that is a sequence: one row for each sector or sphere, and its columns as arrays."""
+"""Scores of the parts of a phantom: a sequence with a row for each sector or sphere, whose columns are arrays."""
 
-from collections.abc import Sequence
+import math
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, Generic, TypeVar, overload
 
@@ -13,13 +14,18 @@ Row = TypeVar("Row")
 
 @dataclass(frozen=True, eq=False)
 class Rows(Sequence[Row], Generic[Row]):
-    """A sequence of rows, of which `column` takes the same attribute."""
+    """Sequence of rows; a subclass has a `column` for each attribute of its rows."""
 
     rows: tuple[Row, ...]
 
     def column(self, name: str) -> Floats:
-        """An attribute of all rows."""
+        """Return an attribute of all rows, (S,)."""
         return np.array([getattr(row, name) for row in self.rows], np.float64)
+
+    @property
+    def cells(self) -> list[tuple[str, str]]:
+        """Names and values, as text, for the table of Blender's panel."""
+        return []
 
     def __len__(self) -> int:
         return len(self.rows)
@@ -33,5 +39,17 @@ class Rows(Sequence[Row], Generic[Row]):
 
 
 def column(name: str, text: str) -> Any:
-    """A property of `Rows`: the attribute of all rows as an array, with its docstring."""
+    """Return a property of `Rows` with docstring `text`: the attribute of all rows as an array (S,)."""
     return property(lambda rows: rows.column(name), doc=text)
+
+
+def aligned_columns(heads: tuple[str, ...], rows: Iterable[tuple[str, ...]]) -> list[str]:
+    """Return the lines of a table whose first column is aligned to the left, and whose others to the right."""
+    lines = [heads, *rows]
+    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
+    return ["  ".join([f"{line[0]:<{widths[0]}}", *map(str.rjust, line[1:], widths[1:])]) for line in lines]
+
+
+def json_number(value: float | None) -> float | None:
+    """Return a number as JSON can hold it: None if it is missing, infinite or NaN."""
+    return None if value is None or not math.isfinite(value) else float(value)

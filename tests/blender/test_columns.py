@@ -1,4 +1,4 @@
-"""Column maps in Blender: the dialog's settings correspond to the map, and the scene keeps it for writing back."""
+"""Columns in Blender: column maps, which the scene keeps for writing back, and columns that are added to the table."""
 
 from __future__ import annotations
 
@@ -12,11 +12,14 @@ import numpy as np
 import openpyxl
 import pytest
 
+from mphdrr.addon import registration
 from mphdrr.addon.scanner import column_maps, scanner
 from mphdrr.core.errors import InputError
-from mphdrr.core.geometry.columns import LENGTH_UNITS
+from mphdrr.core.geometry.columns import LENGTH_UNITS, Column
 from mphdrr.core.geometry.system import PinholeSystem
 from mphdrr.core.workbook import ColumnMap, draft_column_map, read_system
+
+from .conftest import Drawn, refused, reopened, update
 
 CM = {"x1": "Mitte x (Zentimeter)", "y1": "Mitte y (Zentimeter)", "z1": "Mitte z (Zentimeter)"}
 
@@ -220,8 +223,11 @@ def map_file(tmp_path, columns) -> Path:
 
 
 def test_a_refused_workbook_names_the_way_and_a_map_reads_it(scene, unread, map_file, columns, small):
-    with pytest.raises(RuntimeError, match=r"a column map can say what is meant \(columns='map\.toml'"):
-        bpy.ops.mphdrr.import_geometry(filepath=str(unread))
+    refused(
+        bpy.ops.mphdrr.import_geometry,
+        r"a column map can say what is meant \(columns='map\.toml'",
+        filepath=str(unread),
+    )
     assert scanner.scanners(scene) == []
     assert bpy.ops.mphdrr.import_geometry(filepath=str(unread), columns=str(map_file)) == {"FINISHED"}
     collection = scanner.active_scanner(scene)
@@ -237,10 +243,18 @@ def test_an_import_that_is_repeated_does_not_ask_again(scene, unread, columns):
 
 
 def test_a_script_is_told_that_a_dialog_needs_a_window(unread, map_file):
-    with pytest.raises(RuntimeError, match=r"set columns to a column map \(\.toml\) instead"):
-        bpy.ops.mphdrr.import_geometry(filepath=str(unread), choose_columns=True)
-    with pytest.raises(RuntimeError, match=r"none\.toml: no such file"):
-        bpy.ops.mphdrr.import_geometry(filepath=str(unread), columns=str(map_file.with_name("none.toml")))
+    refused(
+        bpy.ops.mphdrr.import_geometry,
+        r"set columns to a column map \(\.toml\) instead",
+        filepath=str(unread),
+        choose_columns=True,
+    )
+    refused(
+        bpy.ops.mphdrr.import_geometry,
+        r"none\.toml: no such file",
+        filepath=str(unread),
+        columns=str(map_file.with_name("none.toml")),
+    )
 
 
 # Writing back
@@ -260,9 +274,7 @@ def test_an_unchanged_scanner_writes_the_same_file(collection, unread, tmp_path)
 @pytest.mark.parametrize("saved", [False, True])
 def test_a_changed_scanner_is_written_by_its_map_in_the_files_unit(saved, collection, scene, tmp_path):
     if saved:
-        bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "scene.blend"))
-        bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "scene.blend"))
-        scene = bpy.context.scene
+        scene = reopened(tmp_path / "scene.blend")
         collection = scanner.active_scanner(scene)
     scanner.module(collection, 7).location.x += 3.0
     scanner.module(collection, 9).mphdrr_module.pinhole_diameter = 2.5
@@ -296,3 +308,71 @@ def test_a_new_workbook_needs_no_map(collection, tmp_path):
     bpy.ops.mphdrr.export_geometry(filepath=str(path), use_template=False)
     assert scanner.source(collection).columns is None
     assert_equal(read_system(path), scanner.read_scanner(collection))
+
+
+ADDED = (
+    Column("shim", "shim_thickness", help="shim under the crystal", blank=0.1, plausible=(0.01, 5)),
+    Column("coat", "hole_coating", kind="choice", choices=("none", "gold"), blank="none", help="coating of the hole"),
+    Column("batch", "crystal_batch", kind="text", blank="", help="batch of the crystal"),
+)
+
+
+@pytest.fixture
+def typed(scene, ring_system, monkeypatch):
+    """A scanner whose table has three more columns, one of each module's own values."""
+    registration.unregister()
+    monkeypatch.setattr(PinholeSystem, "columns", PinholeSystem.columns.with_columns(*ADDED))
+    registration.register()
+    system = ring_system.replace(
+        shim_thickness=np.linspace(0.1, 0.2, 8) / 3, crystal_batch=[f"B {n}" for n in range(8)], hole_coating="gold"
+    )
+    made = scanner.build_scanner(scene, system)
+    update()
+    yield made
+    registration.unregister()
+    monkeypatch.undo()
+    registration.register()
+    assert "shim_thickness" not in bpy.types.Object.bl_rna.properties["mphdrr_module"].fixed_type.properties
+
+
+def test_they_are_properties_with_their_limits_and_words(typed):
+    properties = scanner.module(typed, 1).mphdrr_module.bl_rna.properties
+    shim, coat, batch = (properties[name] for name in ("shim_thickness", "hole_coating", "crystal_batch"))
+    assert (shim.type, shim.name, shim.soft_max) == ("FLOAT", "Shim Thickness", 5.0) and "in mm" in shim.description
+    assert coat.type == "ENUM" and [item.identifier for item in coat.enum_items] == ["none", "gold"]
+    assert batch.type == "STRING" and "batch of the crystal" in batch.description
+
+
+def test_they_are_drawn(typed):
+    module = scanner.module(typed, 1).mphdrr_module
+    for all_at_once, owner in ((False, module), (True, typed.mphdrr_scanner)):
+        bpy.context.scene.mphdrr_geometry.all_at_once = all_at_once
+        owners = Drawn("MPHDRR_PT_design").properties
+        for name in ("shim_thickness", "hole_coating", "crystal_batch", "crystal_material", "pinhole_diameter"):
+            assert owners[name] == owner, name
+
+
+def test_they_are_read_exactly_edited_and_kept(typed, tmp_path):
+    expected = np.linspace(0.1, 0.2, 8) / 3
+    read = scanner.read_scanner(typed)
+    assert np.array_equal(read.shim_thickness, expected) and read.hole_coating.tolist() == ["gold"] * 8
+    module = scanner.module(typed, 3).mphdrr_module
+    module.shim_thickness, module.hole_coating, module.crystal_batch = 0.7, "none", "Ü 7"
+    module.crystal_material = "CsI"
+    expected[2] = 0.7
+    path = str(tmp_path / "columns.blend")
+    reopened(path)
+    opened = scanner.active_scanner(bpy.context.scene)
+    read = scanner.read_scanner(opened)
+    assert np.array_equal(read.shim_thickness, expected)
+    assert read.hole_coating.tolist() == ["gold"] * 2 + ["none"] + ["gold"] * 5
+    assert read.crystal_batch[2] == "Ü 7" and read.crystal_batch[3] == "B 3"
+    assert read.crystal_material.tolist() == ["", "", "CsI", *[""] * 5]
+    assert scanner.losses(opened) == ["module 3 with changed numbers"]
+    assert "hole_coating" in opened.mphdrr_scanner.mixed.split()
+    opened.mphdrr_scanner.crystal_batch = "all"
+    assert scanner.read_scanner(opened).crystal_batch.tolist() == ["all"] * 8
+    scanner.module(opened, 5).mphdrr_module.shim_thickness = 0.0
+    assert "shim_thickness must be more than 0" in scanner.module(opened, 5).mphdrr_module.problem
+    with pytest.raises(InputError, match="module 5"):
+        scanner.read_scanner(opened)

@@ -1,26 +1,26 @@
-"""TOML files: reading with one-line errors, and writing values."""
+"""Read and write TOML, with errors of one line."""
 
 import json
 import tomllib
 from collections.abc import Iterable
 from typing import Any
 
-from .errors import InputError
-from .files import AnyPath, read_text
+from ..errors import InputError
+from ..files import AnyPath, read_text
 
 
 def read_toml(path: AnyPath) -> dict[str, Any]:
-    """What a TOML file holds."""
+    """Return the tables and entries of a TOML file; raise `InputError`, which names the file, if it is not TOML."""
     return parse_toml(toml_text(path), str(path))
 
 
 def toml_text(path: AnyPath) -> str:
-    """The text of a TOML file, every line's end as it is."""
+    """Return the text of a TOML file, with the line ends that it has."""
     return read_text(path, "TOML, a text in UTF-8")
 
 
 def parse_toml(text: str, name: str) -> dict[str, Any]:
-    """What a text in TOML holds; messages call it `name`."""
+    """Return the tables and entries of a TOML text; messages of `InputError` begin with `name`."""
     try:
         return tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
@@ -30,9 +30,9 @@ def parse_toml(text: str, name: str) -> dict[str, Any]:
 
 
 def toml_value(value: Any) -> str:
-    """A text, a boolean, a number or a list of these as TOML."""
+    """Return a text, a boolean, a number, or a list of these, as TOML."""
     if isinstance(value, str):
-        # JSON's escapes are TOML's, except that DEL must be escaped as well.
+        # JSON's escapes are those of TOML, except that TOML also wants DEL escaped.
         return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
     if isinstance(value, bool):
         return str(value).lower()

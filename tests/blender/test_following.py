@@ -1,16 +1,23 @@
-"""A collimator, a crystal or a plane that is moved takes its module along."""
+"""Modules follow the parts that are grabbed, and the panels the scanner whose part is selected."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
 
 import bpy
 import numpy as np
 import pytest
 from mathutils import Euler, Matrix
 
-from mphdrr.addon.blender import objects
-from mphdrr.addon.pictures import planes
-from mphdrr.addon.scanner import grabbing, live_scanner, scanner
+from mphdrr.addon.blender import ids, objects
+from mphdrr.addon.pictures import images, planes, tiles
+from mphdrr.addon.scanner import grabbing, live_scanner, scanner, selection
 from mphdrr.addon.volumes import volumes
+from mphdrr.core.errors import InputError
 from mphdrr.core.geometry.grid import Grid
 from mphdrr.core.volumes.volume import Volume
+
+from .conftest import part, reopened, select, update
 
 MOTION = Matrix.Translation((4.0, -9.0, 6.5)) @ Euler((0.1, -0.2, 0.3)).to_matrix().to_4x4()
 
@@ -21,12 +28,8 @@ def collection(scene, ring_system):
     made.mphdrr_scanner.keep_aimed = False
     volumes.add_volume(Volume(np.ones((2, 2, 2), np.float32), Grid.centered(2, 2.0), "activity"), "Box")
     bpy.ops.mphdrr.render_projections(width=8, height=6)
-    bpy.context.view_layer.update()
+    update()
     return made
-
-
-def part(camera: bpy.types.Object, name: str) -> bpy.types.Object:
-    return next(c for c in camera.children if c.mphdrr_module.part == name)
 
 
 @pytest.mark.parametrize("name", ["COLLIMATOR", "CRYSTAL", "PLANE"])
@@ -37,7 +40,7 @@ def test_the_module_goes_where_a_part_is_put(collection, name):
     local = item.matrix_basis.copy()
     item.matrix_world = MOTION @ item.matrix_world
     for _ in range(3):  # what the handler writes is an update again
-        bpy.context.view_layer.update()
+        update()
     assert np.allclose(camera.matrix_world, MOTION @ before, atol=1e-4)
     assert np.allclose(item.matrix_parent_inverse @ item.matrix_basis, local, atol=1e-6), (
         "it is where it was on its module"
@@ -49,7 +52,7 @@ def test_the_module_goes_where_a_part_is_put(collection, name):
     assert np.array_equal(np.delete(after.centers, 2, 0), np.delete(numbers, 2, 0))
     collection.mphdrr_scanner.keep_aimed = True
     item.location.z += 2.0
-    bpy.context.view_layer.update()
+    update()
     assert camera.mphdrr_module.aimed and scanner.unaimed_numbers(collection, [camera]) == []
 
 
@@ -64,7 +67,7 @@ def test_a_drag_goes_from_where_it_began(collection, monkeypatch):
         for item in items:
             item.location.y = by
         for _ in range(2):
-            bpy.context.view_layer.update()
+            update()
         assert np.allclose(camera.location, start @ Matrix.Translation((0, by, 0)).translation, atol=1e-4)
         assert camera.mphdrr_module.aimed
         assert all(np.allclose(item.matrix_world, camera.matrix_world, atol=1e-4) for item in items)
@@ -73,7 +76,7 @@ def test_a_drag_goes_from_where_it_began(collection, monkeypatch):
         drag(by)
     place = camera.matrix_world.copy()
     live_scanner.after_undo()  # as at the end of the drag
-    bpy.context.view_layer.update()
+    update()
     assert np.allclose(camera.matrix_world, place, atol=1e-5) and camera.mphdrr_module.aimed
     assert all(np.array_equal(item.matrix_basis, np.eye(4)) and not grabbing.is_dragged(item) for item in items)
     start = place
@@ -87,14 +90,14 @@ def test_an_undo_step_taken_before_the_last_motion_was_seen(collection, monkeypa
     start, item = camera.matrix_world.copy(), part(camera, "CRYSTAL")
     monkeypatch.setattr(grabbing, "is_dragging", lambda: True)
     item.location.y = 3.0
-    bpy.context.view_layer.update()
+    update()
     item.location.y = 11.0
     live_scanner.after_undo()
     assert np.allclose(camera.location, start @ Matrix.Translation((0, 11, 0)).translation, atol=1e-4)
     item.location.y = 40.0  # and here none was seen: the next step has where the module went
     place = camera.location.copy()
     live_scanner.after_undo()
-    bpy.context.view_layer.update()
+    update()
     assert camera.location == place and np.array_equal(item.matrix_basis, np.eye(4))
 
 
@@ -103,7 +106,7 @@ def test_what_is_locked_animated_copied_or_moved_itself_is_respected(scene, coll
     item, place = part(camera, "CRYSTAL"), camera.location.copy()
     camera.lock_location = (False, False, True)
     item.matrix_world = Matrix.Translation((1, 2, 3)) @ item.matrix_world
-    bpy.context.view_layer.update()
+    update()
     assert np.allclose(camera.location - place, (1, 2, 0), atol=1e-4)
     assert np.array_equal(item.matrix_basis, np.eye(4))
 
@@ -111,14 +114,14 @@ def test_what_is_locked_animated_copied_or_moved_itself_is_respected(scene, coll
     place = camera.location.copy()
     for moved in (camera, *camera.children):
         moved.location.x += 5.0
-    bpy.context.view_layer.update()
-    bpy.context.view_layer.update()
+    update()
+    update()
     assert np.allclose(camera.location - place, (5, 0, 0), atol=1e-4)
 
     camera.keyframe_insert("location", frame=1)
     place = camera.location.copy()
     item.location.x += 5.0
-    bpy.context.view_layer.update()
+    update()
     assert camera.location == place and np.array_equal(item.matrix_basis, np.eye(4))
 
     other = scanner.module(collection, 6)
@@ -126,7 +129,7 @@ def test_what_is_locked_animated_copied_or_moved_itself_is_respected(scene, coll
     other.users_collection[0].objects.link(copy)
     place = objects.world_matrix(other)
     copy.location.x += 20.0
-    bpy.context.view_layer.update()
+    update()
     assert np.array_equal(objects.world_matrix(other), place) and copy.location.x == 20.0
     assert planes.planes(scene)
 
@@ -136,8 +139,94 @@ def test_parts_that_version_0_1_0_locked_are_freed_and_the_users_locks_stay(coll
     item = part(scanner.module(collection, 1), "CRYSTAL")
     for was_free in (False, True):
         item.lock_location, collection.mphdrr_scanner.parts_free = (True, True, True), was_free
-        bpy.ops.wm.save_as_mainfile(filepath=path)
-        bpy.ops.wm.open_mainfile(filepath=path)
+        reopened(path)
         collection = scanner.active_scanner(bpy.context.scene)
         item = part(scanner.module(collection, 1), "CRYSTAL")
         assert tuple(item.lock_location) == (was_free,) * 3
+
+
+@pytest.fixture
+def a_and_b(scene, ring_system):
+    made = [scanner.build_scanner(scene, ring_system, "A"), scanner.build_scanner(scene, ring_system[2:7], "B")]
+    update()
+    return made
+
+
+def shown(scene: bpy.types.Scene) -> tuple[str, int, int]:
+    """The panels' scanner, and the numbers of its listed and active modules."""
+    listed, active = selection.listed_module(scene), selection.active_module(bpy.context)
+    return scanner.active_scanner(scene).name, listed.mphdrr_module.number, active.mphdrr_module.number
+
+
+def test_the_panels_follow_the_selection(scene, a_and_b):
+    a, b = a_and_b
+    assert shown(scene) == ("B", 3, 3), "the new one"
+    select(scanner.module(a, 6))
+    assert shown(scene) == ("A", 6, 6)
+    select(part(scanner.module(b, 5), "CRYSTAL"))
+    assert shown(scene) == ("B", 5, 5)
+    select(next(o for o in a.objects if o.mphdrr_module.part == "ROI"))
+    assert shown(scene)[0] == "A"
+    select(scene.objects["Cube"])
+    assert shown(scene)[0] == "A", "no scanner's"
+    scene.mphdrr_geometry.scanner = b
+    update()
+    assert shown(scene) == ("B", 3, 3), "what is chosen in the panel stays chosen"
+    scene.mphdrr_geometry.active_index = b.all_objects.find(scanner.module(b, 7).name)
+    update()
+    assert shown(scene) == ("B", 7, 7) and bpy.context.selected_objects == [scanner.module(b, 7)]
+    scanner.show_modules(a, 5, 5)
+    scene.mphdrr_geometry.scanner = a
+    scene.mphdrr_geometry.active_index = a.all_objects.find(scanner.module(a, 8).name)
+    update()
+    assert shown(scene) == ("A", 8, 8), "also a module that is hidden"
+
+
+def test_each_edit_changes_the_selected_one(scene, a_and_b):
+    for mine, other in (a_and_b, a_and_b[::-1]):
+        before = scanner.read_scanner(other)
+        select(part(scanner.module(mine, 4), "COLLIMATOR"))
+        panel = scanner.active_scanner(scene)
+        panel.mphdrr_scanner.detector_thickness = 7.5
+        selection.active_module(bpy.context).mphdrr_module.pinhole_diameter = 3.5
+        bpy.ops.mphdrr.show_modules(first=4, last=5, mode="ONLY")
+        bpy.ops.mphdrr.duplicate_modules(count=1, angle=np.radians(14))
+        select(scanner.module(mine, 5))
+        bpy.ops.mphdrr.remove_modules()
+        now = scanner.read_scanner(mine)
+        assert 5 not in now.numbers and (now.detector_thickness == 7.5).all() and 3.5 in now.pinhole_diameter
+        after = scanner.read_scanner(other)
+        for name in ("centers", "numbers", "detector_thickness", "pinhole_diameter"):
+            assert np.array_equal(getattr(before, name), getattr(after, name)), name
+        mine.mphdrr_scanner.detector_thickness = 9.5
+        scanner.show_modules(mine, 0, 0, "ALL")
+
+
+def test_a_run_belongs_to_its_scanner(scene, a_and_b):
+    a, b = a_and_b
+    volumes.add_volume(Volume(np.ones((2, 2, 2), np.float32), Grid.centered(2, 2.0), "activity"), "Box")
+    select(scanner.module(a, 1))
+    bpy.ops.mphdrr.render_projections(width=8, height=8)
+    select(scanner.module(b, 6))
+    mosaic = bpy.data.images[ids.MOSAIC]
+    scene.mphdrr_display.colors = "GREY"  # made anew
+    assert images.scanner_of(mosaic) == a and {plane.parent for plane in planes.planes(scene)} == set(
+        scanner.modules(a)
+    )
+
+    found = images.tiles(mosaic)
+    row, column = np.reshape(found["corners"], (-1, 2))[found["numbers"].index(6)]
+    width, height = mosaic.size
+    assert tiles.active_tile(bpy.context, mosaic) is None, "module 6 of B has no image here"
+    view = SimpleNamespace(region_to_view=lambda x, y: (x, y))
+    context = SimpleNamespace(
+        space_data=SimpleNamespace(image=mosaic), region=SimpleNamespace(view2d=view), scene=scene,
+        view_layer=bpy.context.view_layer, mode="OBJECT",
+    )  # fmt: skip
+    place = (column + 3) / width, 1 - (row + 3) / height
+    assert tiles.pick_module(context, *place) == scanner.module(a, 6).name
+    update()
+    assert shown(scene) == ("A", 6, 6) and tiles.active_tile(bpy.context, mosaic) == found["numbers"].index(6)
+    bpy.data.collections.remove(a)
+    with pytest.raises(InputError, match="not in the scene"):
+        tiles.pick_module(context, *place)

@@ -1,8 +1,9 @@
-"""Files store choices by fixed numbers: a saved choice opens as the same choice, whatever has been added since."""
+"""Files of earlier versions open with the choices, scanner, phantom and runs that they were saved with."""
 
 from __future__ import annotations
 
 import json
+import shutil
 import subprocess
 import sys
 import zlib
@@ -13,9 +14,17 @@ import numpy as np
 import pytest
 
 from mphdrr.addon import registration
-from mphdrr.addon.blender import choices
+from mphdrr.addon.blender import choices, storage
+from mphdrr.addon.pictures import images
+from mphdrr.addon.runs import runs
+from mphdrr.addon.scanner import scanner
+from mphdrr.addon.volumes import volumes
+from mphdrr.core.runs.files import read_run
 
-SAVED = Path(__file__).parent / "data" / "choices-0.1.0.blend"
+from .conftest import Drawn
+
+DATA = Path(__file__).parent / "data"
+SAVED = DATA / "choices-0.1.0.blend"
 """Every choice that a scene can keep, numbered by position as version 0.1.0 did; what they are is in its text."""
 RENAMED = {"NUMBA": "CPU"}
 """Identifiers that have changed since; their numbers have not."""
@@ -231,3 +240,98 @@ def test_a_file_of_the_first_version_opens_with_the_choices_it_was_saved_with(it
     assert isotopes == set(FROZEN["ProjectionProperties"]["isotope"])
     materials = {paths["mphdrr_projections.crystal_material"] for paths in read["scenes"].values()}
     assert materials == set(FROZEN["ProjectionProperties"]["crystal_material"])
+
+
+def opened(name: str, folder: Path) -> bpy.types.Scene:
+    """Open a copy of a .blend with its folder, and return its scene."""
+    shutil.copytree(DATA / f"{name}_mphdrr", folder / f"{name}_mphdrr")
+    shutil.copy(DATA / f"{name}.blend", folder)
+    bpy.ops.wm.open_mainfile(filepath=str(folder / f"{name}.blend"))
+    return bpy.context.scene
+
+
+@pytest.fixture
+def old_scene(scene, tmp_path):
+    return opened("scene-0.1.0", tmp_path)
+
+
+def test_the_scanner_reads_back_exactly(old_scene):
+    collection = scanner.active_scanner(old_scene)
+    system = scanner.read_scanner(collection)
+    assert system.numbers.tolist() == [3, 31, 66]
+    assert system.centers.tolist() == [
+        [201.3326, 136.87, -68.0519], [-170.499, 95.57272, -23.9678], [56.74056, 177.7703, 71.7895],
+    ]  # fmt: skip
+    assert system.pinhole_diameter.tolist() == [2.3, 2.7, 2.3]
+    np.testing.assert_allclose(system.collimator_length, [75.55147057014942, 61.3, 57.9776304498216], rtol=1e-14)
+    assert system.collimator_length[1] == 61.3
+    for name, value in (("detector_side", 50.0), ("detector_thickness", 10.0), ("roi_radius", 75.0)):
+        assert getattr(system, name).tolist() == [value] * 3
+    assert [camera.mphdrr_module.visible for camera in scanner.modules(collection)] == [True, True, False]
+    assert [camera.mphdrr_module.length_mode for camera in scanner.modules(collection)] == [
+        "FROM_ROI", "TYPED", "FROM_ROI",
+    ]  # fmt: skip
+    assert scanner.losses(collection) == ["module 3 moved or turned", "modules 3, 31 with changed numbers"]
+    assert scanner.source(collection).cell("x1", 31) == ("Coordinates", "B4")
+
+
+def test_settings_are_there(old_scene):
+    built = scanner.active_scanner(old_scene).mphdrr_scanner
+    for name, value in {
+        "scanner_name": "Three", "n_modules": 3, "plate_thickness": 3.5, "wall_thickness": 1.25, "edge_at": "BACK",
+        "opening_angle": np.radians(60), "intrinsic_fwhm": 3.2, "keep_aimed": False,
+        "mixed": "pinhole_diameter collimator_length length_mode", "count": 3, "untidy": "",
+    }.items():  # fmt: skip
+        assert getattr(built, name) == (pytest.approx(value) if isinstance(value, float) else value), name
+    rendered = old_scene.mphdrr_projections
+    for name, value in {
+        "model": "EMISSION", "isotope": "Tc-99m", "aperture_material": "tungsten", "crystal_material": "CZT",
+        "magnification": 8.0, "width": 24, "height": 16, "detector": "VIRTUAL", "noise": False,
+    }.items():  # fmt: skip
+        assert getattr(rendered, name) == value, name
+
+
+def test_phantom_and_projections_are_there(old_scene):
+    (phantom,) = volumes.volume_objects(old_scene)
+    settings = phantom.mphdrr_volume
+    assert (settings.kind, settings.quantity, settings.derenzo.voxels) == ("DERENZO", "activity", 16)
+    assert settings.derenzo.activity == 80.0
+    assert volumes.volume_from_object(phantom).array.max() == pytest.approx(settings.maximum)
+    phantom.mphdrr_volume.display_high = 33.0
+    looked = phantom.data.materials[0].node_tree.nodes["Display Range"].inputs["From Max"]
+    assert looked.default_value == 33.0, "its material has no look, and follows all the same"
+    run = read_run(storage.absolute(old_scene.mphdrr_projections.run_file))
+    assert run.system.numbers.tolist() == [3, 31, 66] and run.projections.shape == (3, 16, 24)
+    for number, projection in zip(run.system.numbers, run.projections, strict=True):
+        image = bpy.data.images[f"mphDRR {number:02d}"]
+        np.testing.assert_array_equal(images.projection_array(image), projection)
+
+
+def test_a_file_of_version_0_1_0_shows_its_run(old_scene):
+    settings = old_scene.mphdrr_projections
+    (item,) = settings.runs
+    assert item.file == settings.run_file and runs.changes(old_scene) == [runs.UNKNOWN]
+    assert runs.UNKNOWN in " ".join(Drawn("MPHDRR_PT_runs").texts)
+    settings.width, settings.height = 12, 8
+    bpy.ops.mphdrr.render_projections()
+    assert runs.changes(old_scene) == [] and len(settings.runs) == 2
+    settings.active_run = 0
+    assert images.projection_array(bpy.data.images["mphDRR 03"]).shape == (16, 24)
+
+
+def test_two_runs_of_blender_4_5_open_in_every_version(scene, tmp_path):
+    """Three modules; Module 03 was moved and the phantom turned between the runs, of which the second is shown."""
+    scene = opened("runs-4.5", tmp_path)
+    settings = scene.mphdrr_projections
+    first, second = settings.runs
+    assert (first.name, second.name) == ("Before", "Derenzo, emission") and runs.shown_run(scene) == second
+    hole = ["hole Rays, now Automatic"]  # its middle, the default of that version
+    assert runs.changes(scene, first) == ["Module 03 moved", "phantom Derenzo turned", *hole]
+    assert runs.changes(scene) == hole
+    settings.hole, settings.aperture_points = "RAYS", 1
+    expected = read_run(storage.absolute(second.file)).projections
+    assert np.array_equal(images.projection_array(bpy.data.images["mphDRR 66"]), expected[2])
+    assert bpy.ops.mphdrr.render_projections() == {"FINISHED"}
+    again = read_run(storage.absolute(settings.runs[-1].file)).projections
+    np.testing.assert_allclose(again, expected, rtol=1e-6)
+    assert runs.changes(scene, settings.runs[1]) == []

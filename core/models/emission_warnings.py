@@ -1,6 +1,6 @@
-"""Checks of attenuation coefficients that look wrong, though they may be meant: warnings, each with its number.
+"""Warnings of settings, attenuation and images of an `Emission` that look wrong, though they may be meant.
 
-The `model` of these functions is an `Emission`.
+The `model` of these functions is the `Emission`.
 """
 
 from collections.abc import Iterator
@@ -10,8 +10,11 @@ import numpy as np
 
 from ..arrays import Floats32
 from ..geometry.collimator import Construction
+from ..geometry.grid import Grid
+from ..geometry.views import Views
 from ..physics.materials import APERTURES, attenuation
 from ..volumes.volume import Volume
+from .pixel_points import expected_error, shadow_edges
 
 _LARGEST_PLATE_SHARE = 0.005
 """Share of the photons that may pass the solid plate without a warning."""
@@ -53,6 +56,42 @@ def mu_warnings(mu: Floats32, model: Any) -> Iterator[str]:
     bone = _largest_coefficient(model, "bone")
     if (high := mu[mu > _ABOVE_BONE * bone]).sum(dtype=float) > 0.5 * mu.sum(dtype=float):
         yield f"mu is {high.mean():.3g} 1/mm where most photons are lost, bone's is {bone:.3g}: is it in 1/cm?"
+
+
+def image_warnings(volume: Volume, views: Views, model: Any) -> Iterator[str]:
+    """Yield a warning of activity below 0, and of images that reach beyond the crystals."""
+    lowest, highest = float(volume.array.min()), float(volume.array.max())
+    if lowest < -0.1 * abs(highest):  # interpolation leaves smaller values below 0
+        yield f"the activity is {lowest:g} to {highest:g} kBq/mL: what is below 0 makes counts below 0"
+    if model.within_crystal:
+        return
+    system = model.system
+    magnification = np.linalg.norm(views.detector_centers - views.sources, axis=1) / system.collimator_length
+    steps = np.stack([views.u_steps, views.v_steps])
+    sides = np.linalg.norm(steps, axis=2) * np.array(views.shape[::-1])[:, None] / magnification  # on the crystal, mm
+    if beyond := int(np.any(sides > 1.001 * system.detector_side, axis=0).sum()):
+        yield (
+            f"{beyond} of {len(views)} images are wider than the crystal: pixels beside it count photons that nothing "
+            "detects, unless within_crystal (Crystal's Side) leaves them out"
+        )
+
+
+def ray_caution(model: Any, views: Views, grid: Grid) -> str | None:
+    """Return a warning if a model by rays has too few of them for its tolerance, or None."""
+    edges = [shadow_edges(views, m, grid) for m in range(len(views))]
+    points = [(model.pixel_points_needed(views, m, grid), model.hole_points(views, m, grid)) for m in range(len(views))]
+    errors = [expected_error(edge, *numbers) for edge, numbers in zip(edges, points, strict=True)]
+    error, module = max(errors), int(np.argmax(errors))
+    if error <= model.tolerance:
+        return None
+    n, voxel = points[module][0], " x ".join(f"{size:.3g}" for size in grid.spacing)
+    percent = "more than 100" if error > 1 else f"up to {100 * error:.2g}"
+    advice = "take smaller pixels, or larger voxels"
+    if model.pixel_points is not None:
+        advice = f"pixel_points=None (--pixel-points auto) takes as many as keep {100 * model.tolerance:g} %"
+    rays = f"{n} point{'s' * (n > 1)} of each pixel"
+    off = f"{percent} % off (in module {model.system.numbers[module]}), those of larger sources less"
+    return f"emission: with {rays} the total counts of a single voxel of {voxel} mm may be {off}; {advice}"
 
 
 def _largest_coefficient(model: Any, material: str) -> float:

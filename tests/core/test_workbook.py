@@ -525,6 +525,29 @@ def _unnumbered(main: Worksheet, coordinates: Worksheet) -> None:
     coordinates.delete_cols(1)
 
 
+def _numbered_in_main(numbers: list[object], heading: str = "") -> Callable[[Worksheet, Worksheet], None]:
+    """Return the edit that gives the rows of Main alone these numbers or names."""
+
+    def edit(main: Worksheet, coordinates: Worksheet) -> None:
+        _typed(main, coordinates)
+        coordinates.delete_cols(1)
+        for row, value in enumerate([heading, *numbers], start=2):
+            main.cell(row, 1).value = value
+
+    return edit
+
+
+def _two_number_columns(main: Worksheet, coordinates: Worksheet) -> None:
+    for row, value in enumerate(["module number", 4, 3, 2, 1], start=2):
+        coordinates.cell(row, 24).value = value
+
+
+def _text_between(main: Worksheet, coordinates: Worksheet) -> None:
+    _typed(main, coordinates)
+    coordinates.insert_rows(5)
+    coordinates["B5"] = "upper ring"
+
+
 def _without_coordinates(main: Worksheet, coordinates: Worksheet) -> None:
     _one_sheet(main, coordinates)
     for column in range(1, 15):
@@ -604,6 +627,10 @@ BAD_CELLS = {
     ),
     "headings at odds": (_set("Coordinates", "B1", "y2"), "Coordinates!B2 is headed as x1 but Coordinates!B1 as y2"),
     "two tables": (_copied_table, "A!B1 and B!B1, of two sheets, are both headed as x1"),
+    "numbers in no order in one sheet": (_numbered_in_main([2, 1, 3, 4]), "in no order, sheet Coordinates has none"),
+    "names in one sheet": (_numbered_in_main(list("abcd"), "serial"), "Main!A2 heads names of modules"),
+    "two columns of numbers": (_two_number_columns, "both head the modules' numbers, expected one such column"),
+    "headings between modules": (_text_between, "between rows of modules, expected one table"),
     "unit in the other sheet": _bad("Main!H1", "all in cm", "holds 'all in cm'"),
     "module without coordinates": (_without_coordinates, "Coordinates!A4 is blank, expected a module's number"),
     "text below modules without numbers": (

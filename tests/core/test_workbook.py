@@ -545,7 +545,7 @@ def _two_number_columns(main: Worksheet, coordinates: Worksheet) -> None:
 def _text_between(main: Worksheet, coordinates: Worksheet) -> None:
     _typed(main, coordinates)
     coordinates.insert_rows(5)
-    coordinates["B5"] = "upper ring"
+    coordinates["E5"] = "upper ring"
 
 
 def _without_coordinates(main: Worksheet, coordinates: Worksheet) -> None:

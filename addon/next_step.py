@@ -91,7 +91,7 @@ def tutorial() -> str:
 
 
 def _projectable_volumes(scene: bpy.types.Scene) -> list[bpy.types.Object]:
-    """Return the volumes that may be projected: no maps, and not the reconstruction."""
+    """Return the volumes of the scene that may be projected: all but the reconstruction and the scanner's maps (`MAPS`)."""
     result = scene.mphdrr_reconstruction.volume
     return [item for item in volumes.volume_objects(scene) if item != result and volumes.quantity_of(item) not in MAPS]
 

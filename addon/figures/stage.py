@@ -91,7 +91,11 @@ class FigureScene:
         return item
 
     def show(self, turn: float, lit: list[int], rays: list[int]) -> None:
-        """Show a moment: place the camera, light modules, and let those fade that stand in the camera's way."""
+        """Show a moment of the animation: the camera's place, lit modules, rays, and faded modules in the camera's way.
+
+        `turn` is the camera's angle around z, rad; `lit` and `rays` are the numbers of the modules that are lit, and that show
+        their rays.
+        """
         cos, sin = np.cos(turn), np.sin(turn)
         direction = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]]) @ DIRECTION
         points = (self.studio.near or 1.0) * self.radius * _SPHERE
@@ -99,11 +103,14 @@ class FigureScene:
             points = np.concatenate([points, *(part.vertices for part in self.full_system.parts())])
         aim_camera(self.camera, direction, self.page, points, self.top)
         # The scale at the isocentre.
-        longer, distance = max(self.page.width, self.page.height), float(np.array(self.camera.location) @ direction)
-        self.pixels_per_mm = longer * self.studio.lens / _SENSOR_WIDTH / distance
+        longer_side, distance = (
+            max(self.page.width, self.page.height),
+            float(np.array(self.camera.location) @ direction),
+        )
+        self.pixels_per_mm = longer_side * self.studio.lens / _SENSOR_WIDTH / distance
         numbers, self.ray_numbers = self.system.numbers, rays
-        front = -self.system.frames()[:, 2] @ direction
-        opacity = np.clip((_GONE - front) / (_GONE - _SOLID), 0.0, 1.0) if self.studio.cut else np.ones(len(numbers))
+        facing = -self.system.frames()[:, 2] @ direction
+        opacity = np.clip((_GONE - facing) / (_GONE - _SOLID), 0.0, 1.0) if self.studio.cut else np.ones(len(numbers))
         opacity = np.maximum(opacity, _MIN_OPACITY * np.isin(numbers, rays) * (len(rays) == 1))
         values = {"lit": _TINT * np.isin(numbers, lit) * self.studio.lit, "there": opacity}
         for mesh, module in self._modules:

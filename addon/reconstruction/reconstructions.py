@@ -48,7 +48,7 @@ MORE_ITERATIONS = 10
 
 @dataclass(frozen=True)
 class _ShownState:
-    """State of a reconstruction for display in the scene."""
+    """Contents of the scene for a reconstruction, running or finished: stored volume, picture of its slices, and record."""
 
     stored: stored_volumes.StoredVolume
     picture: bytes  # PNG of slices, beside the truth if there is one, and the objective

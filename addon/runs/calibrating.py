@@ -63,7 +63,7 @@ def _require_same_scanner(collection: bpy.types.Collection, calibration: Calibra
 
 
 def _mark_misfits(collection: bpy.types.Collection, calibration: Calibration) -> None:
-    """Note at each module whether it fits."""
+    """Write into each module's `finding` why its images do not fit the calibration; an empty text where they do."""
     for number, misfit in zip(calibration.system.numbers.tolist(), calibration.misfit.tolist(), strict=True):
         reason = f"misfit {misfit:.1f}, where 1 is usual" if np.isfinite(misfit) else "its images fit no place nearby"
         text = f"Does not fit its calibration: {reason}" if number in calibration.misfitting else ""

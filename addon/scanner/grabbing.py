@@ -98,7 +98,11 @@ def put_back(item: bpy.types.Object) -> None:
 
 
 def _is_moved_itself(camera: bpy.types.Object, dragging: bool) -> bool:
-    """Return whether a camera has been moved, or is animated or constrained."""
+    """Return whether a module's camera does not follow its parts.
+
+    It has left the position where it was last built, is selected while something is dragged (`dragging`), or is animated or
+    constrained.
+    """
     position = objects.world_matrix(camera)[:3, 3].astype(np.float32)
     was_moved = np.any(np.array(camera.mphdrr_module.placed, np.float32) != position)
     return bool(was_moved) or (dragging and camera.select_get()) or not following.is_free(camera)

@@ -58,9 +58,10 @@ def store_volume(
 
 
 def write_states(states: Sequence[Volume], folder: Path, provenance: dict[str, Any] | None = None) -> Path:
-    """Write volumes in their object's space, and coarser copies of large ones; return the first file to show.
+    """Write the states of one volume, such as phases of a beating heart, as .vdb files; return the first file to show.
 
-    The files' names are made from their content.
+    Where a state has too many voxels to show, coarser copies of all are written, too, and the first of those is returned.
+    `provenance` is stored in the files. Names are made from the content, so that equal volumes share files.
     """
     digest = hashlib.sha256()
     for state in states:

@@ -110,17 +110,20 @@ class DepthZone:
 
     @property
     def curvature(self) -> float:
-        """Coefficient c of the separable weight's second-order term 1 + c |t_v - t_p|^2, of voxel's and pixel's slopes."""
+        """Coefficient c of the factor 1 + c |t_v - t_p|^2 that corrects the separable weight to second order.
+
+        t_v and t_p are the slopes of the lines from the hole's centre to the voxel and to the pixel; c has no unit.
+        """
         return 1.5 * self.pixel_exponent * (1 - self.pixel_exponent)
 
     @property
     def kernel_shape(self) -> KernelShape:
-        """Numbers of the pixels' kernels."""
+        """Shape of the pixels' kernels: hole, magnification, edges of pieces and curvature, in units of cells."""
         numbers, cell_size = self.numbers, self.cell_size
         curvature = self.curvature * (cell_size / numbers.length) ** 2
-        hole_diameter = numbers.diameter / np.abs(cell_size)
-        edges = self.transverse_edges / cell_size[:, None]
-        return KernelShape(hole_diameter, numbers.length * self.inverse_depths, edges, curvature)
+        hole_cells = numbers.diameter / np.abs(cell_size)
+        edge_cells = self.transverse_edges / cell_size[:, None]
+        return KernelShape(hole_cells, numbers.length * self.inverse_depths, edge_cells, curvature)
 
     def crystal_positions(self, first: list[int], shape: tuple[int, ...], step: Array) -> tuple[Array, Array]:
         """Return the positions on the crystal of rows, v (n, 1), and columns, u (n,), mm, numbered from `first` on."""

@@ -95,7 +95,11 @@ def tv(
 
 
 def total_variation(x: Array, grid: Grid, pairs: Array | float = 1.0) -> float:
-    """Return the total variation of `x` as `tv` defines it; `pairs` (3, ...) are 0 at differences to leave out."""
+    """Return the isotropic total variation of `x` (n_x, n_y, n_z), in its unit: the sum of the gradients' lengths.
+
+    Differences to the next voxel along an axis are divided by its spacing in units of the smallest. `pairs`, (3, n_x, n_y,
+    n_z) or a number, multiplies them: 0 leaves a difference out.
+    """
     slopes = pairs * _gradient(x.astype(np.float64), grid.spacing.min() / grid.spacing)
     return float(np.sum(np.sqrt(np.sum(slopes**2, axis=0))))
 

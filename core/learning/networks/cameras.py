@@ -87,13 +87,17 @@ class CameraNets(Network):
         return (sample.counts - sample.background) / (uniform + 0.05 * uniform.max()) / scale
 
     def _outputs(self, setup: ScannerSetup, images: Tensor, volumes: Tensor, cameras: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the outputs (B, V, outputs, …) of V cameras on the volume's grid, and visibility (1, V, 1, …).
+        """Return the camera network's outputs (B, V, F, n_x, n_y, n_z) for V cameras, and which voxels each camera sees.
 
-        `images` (B, V, 2, n_v, n_u) are those of the cameras; `cameras` (V,) are their indices.
+        `images` (B, V, 2, n_v, n_u) are the cameras' own, `volumes` (B, C, n_x, n_y, n_z) the same for all. The visibility (1, V, 1, n_x, n_y, n_z) is 1 where a camera sees a voxel, else 0.
         """
-        views = setup.maps.to_views(volumes, cameras)  # (B, V, volumes, n_u, n_v, n_k)
-        n_k = views.shape[-1]
-        spread = images.transpose(-1, -2)[..., None].expand(*views.shape[:2], 2, *views.shape[3:])
-        depth = torch.linspace(-1, 1, n_k, dtype=views.dtype, device=views.device).expand_as(views[:, :, :1])
-        outputs = self.camera(torch.cat([spread, views, depth], 2).flatten(0, 1)).unflatten(0, views.shape[:2])
+        view_volumes = setup.maps.to_views(volumes, cameras)  # (B, V, volumes, n_u, n_v, n_k)
+        n_k = view_volumes.shape[-1]
+        view_images = images.transpose(-1, -2)[..., None].expand(*view_volumes.shape[:2], 2, *view_volumes.shape[3:])
+        depth = torch.linspace(-1, 1, n_k, dtype=view_volumes.dtype, device=view_volumes.device).expand_as(
+            view_volumes[:, :, :1]
+        )
+        outputs = self.camera(torch.cat([view_images, view_volumes, depth], 2).flatten(0, 1)).unflatten(
+            0, view_volumes.shape[:2]
+        )
         return setup.maps.to_volume(outputs, cameras)

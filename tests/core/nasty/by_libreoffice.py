@@ -10,145 +10,61 @@ import subprocess
 import sys
 import tempfile
 from pathlib import Path
+from typing import Any
 
-from .case import REFUSED, RIGHT, WARNED_OF, Catalogue
-from .scanners import (
-    BIG,
-    ONE_SHEET_COLUMNS,
-    SCANNER,
-    SYMBOLS,
-    one_sheet,
-    one_sheet_map,
-    scanner,
-    typed,
-    users,
-    users_map,
-)
-from .sheets import Book, Formula, by_hand
+from .decorations import SAME, changed_since, further_sheet, number_format, text
+from .layouts import BIG, GEOMETRY, SCANNER, USERS, Draft, Layout, laid_out, scanner
+from .sheets import Formula, by_hand
 
-CASES = Catalogue("LibreOffice")
 REAL = Path(__file__).parents[3] / "examples" / "dc-spect-80.xlsx"
 FOLDER = Path(__file__).parent / "files"
-SAVED: dict[str, Book] = {}
+DRAFTS: dict[str, Draft] = {}
 """What LibreOffice was given, by the name of the file that it made of it."""
 
 
-def _add(name: str, book: Book, truth, *allowed: str, **more) -> None:
-    file = name.replace(" ", "_") + ("" if "." in name else ".xlsx")
-    SAVED[file] = book
-    CASES.add(name, lambda path: shutil.copy(FOLDER / file, path), truth, *allowed, **more)
+def _add(file: str, layout: Layout, *decoration: Any) -> Draft:
+    draft = DRAFTS[file] = laid_out(layout, SCANNER if layout.formulas else BIG)
+    if decoration:
+        decoration[0](draft, *decoration[1:])
+    return draft
 
 
-def _without_values(book: Book) -> Book:
-    for sheet in book.sheets:
-        for at, value in sheet.cells.items():
-            if isinstance(value, Formula):
-                sheet[at] = Formula(value.text)
-    return book
-
-
-def _stale() -> Book:
-    book = users()
-    book["Main"]["P4"] = 3.1
-    return book
-
-
-def _formats(code: str, unit: str) -> Book:
-    book = one_sheet(BIG, unit=unit)
-    for column in ONE_SHEET_COLUMNS.values():
-        for row in range(2, 6):
-            book.sheets[0].formats[f"{column}{row}"] = code
-    return book
-
-
-def _merged(text: str, unit: str) -> Book:
-    book = one_sheet(BIG, unit=unit, top=2)
-    book.sheets[0]["B1"] = text
-    book.sheets[0].merged.append("B1:I1")
-    return book
-
-
-def _noted() -> Book:
-    book = one_sheet(BIG, unit="cm")
-    book.sheets[0].notes["B1"] = "in cm"
-    return book
-
-
-def _hidden() -> Book:
-    book = users(scanner(SCANNER.centers * 1.1))
-    book["Coordinates"].state = "hidden"
-    shown = users()["Coordinates"]
-    shown.name = "Coordinates 2022"
-    book.sheets.append(shown)
-    return typed(book)
-
-
-_add("users", _without_values(users()), SCANNER, RIGHT)
-_add(
-    "users calculated anew",
-    _stale(),
-    scanner(d=[2.3, 3.1, 2.3, 2.3]),
-    RIGHT,
-    REFUSED,
-    place="Coordinates!",
-    unmappable="stale values",
-)
-_add("one sheet", one_sheet(BIG), BIG, RIGHT)
-_add("headings in cm", one_sheet(BIG, {q: f"{SYMBOLS[q]} (cm)" for q in ONE_SHEET_COLUMNS}, "cm"), BIG, RIGHT)
-_add(
-    "number format in cm",
-    _formats('0.000" cm"', "cm"),
-    BIG,
-    RIGHT,
-    REFUSED,
-    place="Geometry!",
-    columns=one_sheet_map("cm"),
-)
-_add(
-    "number format in mm", _formats('0.000" mm"', "mm"), BIG, RIGHT, REFUSED, place="Geometry!", columns=one_sheet_map()
-)
-_add(
-    "cm merged over the headings",
-    _merged("cm", "cm"),
-    BIG,
-    RIGHT,
-    REFUSED,
-    place="Geometry!",
-    columns=one_sheet_map("cm", 3, 6),
-)
-_add("note in cm", _noted(), BIG, REFUSED, WARNED_OF, place="Geometry!B1", columns=one_sheet_map("cm"))
-_add(
-    "hidden Coordinates",
-    _hidden(),
-    SCANNER,
-    REFUSED,
-    place="Coordinates",
-    columns=users_map(position={"sheet": "Coordinates 2022"}),
-)
-_add("users.xls", users(), SCANNER, REFUSED, place="scanner.xlsx", unmappable="an .xls file under another name")
-_add("users.ods", users(), SCANNER, REFUSED, place="scanner.xlsx", unmappable="an .ods file under another name")
-_add("one sheet.csv", one_sheet(BIG), BIG, REFUSED, place="scanner.xlsx", unmappable="a .csv file under another name")
-_add(
-    "one sheet.html", one_sheet(BIG), BIG, REFUSED, place="scanner.xlsx", unmappable="an .html file under another name"
-)
+CENTIMETRES = Layout(**{**vars(GEOMETRY), "unit": "cm"})
+BAND = Layout(**{**vars(GEOMETRY), "top": 1})
+users = _add("users.xlsx", USERS)
+for sheet in users.book.sheets:
+    sheet.cells = {at: Formula(v.text) if isinstance(v, Formula) else v for at, v in sheet.cells.items()}
+stale = _add("users_calculated_anew.xlsx", USERS, changed_since, "d")
+stale.truth, stale.clear, stale.mappable = scanner(d=[2.3 * 1.3, 2.3, 2.3, 2.3]), True, False
+_add("one_sheet.xlsx", GEOMETRY)
+_add("headings_in_cm.xlsx", CENTIMETRES)
+_add("number_format_in_cm.xlsx", GEOMETRY, number_format, '0.000" cm"', "cm", "all")
+_add("number_format_in_mm.xlsx", GEOMETRY, number_format, '0.000" mm"', SAME, "all")
+_add("cm_merged_over_the_headings.xlsx", BAND, text, "band", "cm", "cm")
+_add("note_in_cm.xlsx", GEOMETRY, text, "note of a heading", "in cm", "cm")
+hidden = _add("hidden_Coordinates.xlsx", USERS, further_sheet, "Coordinates 2022", "other numbers", "visible")
+hidden.book["Coordinates"].state = "hidden"
+UNREADABLE = ("users.xls", "users.ods", "one_sheet.csv", "one_sheet.html")
+"""Files that LibreOffice made of the same workbooks, and that are refused."""
 
 
 def make() -> None:
-    """Have LibreOffice save every one of `SAVED`."""
+    """Have LibreOffice save every one of `DRAFTS`."""
     FOLDER.mkdir(exist_ok=True)
     with tempfile.TemporaryDirectory() as name:
-        given = Path(name) / "given"
-        given.mkdir()
-        for file, book in SAVED.items():
-            by_hand(book, given / f"{Path(file).stem}.xlsx")
-        shutil.copy(REAL, given / REAL.name)
-        for suffix in sorted({Path(file).suffix for file in SAVED}):
-            files = [given / f"{Path(file).stem}.xlsx" for file in [*SAVED, REAL.name] if file.endswith(suffix)]
+        folder = Path(name) / "given"
+        folder.mkdir()
+        for file, draft in DRAFTS.items():
+            by_hand(draft.book, folder / file)
+        shutil.copy(REAL, folder / REAL.name)
+        saved = [*DRAFTS, REAL.name, *UNREADABLE]
+        for suffix in sorted({Path(file).suffix for file in saved}):
+            files = [folder / f"{Path(file).stem}.xlsx" for file in saved if file.endswith(suffix)]
             command = ["soffice", f"-env:UserInstallation={(Path(name) / 'profile').as_uri()}", "--headless"]
             subprocess.run(
                 [*command, "--convert-to", suffix[1:], "--outdir", str(FOLDER), *map(str, files)], check=True
             )
-    missing = [file for file in SAVED if not (FOLDER / file).is_file()]
+    missing = [file for file in saved if not (FOLDER / file).is_file()]
     sys.exit(f"not saved: {missing}" if missing else 0)
 
 

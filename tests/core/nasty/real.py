@@ -2,28 +2,30 @@
 
 from __future__ import annotations
 
+import functools
 import shutil
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import openpyxl
+import pytest
 from openpyxl.workbook import Workbook
 from openpyxl.worksheet.worksheet import Worksheet
 
 from mphdrr.core import PinholeSystem
 
-from .case import RIGHT, Catalogue
 from .sheets import Book, Formula, Sheet, by_hand, by_xlsxwriter
 
-CASES = Catalogue("real workbook")
 REAL = Path(__file__).parents[3] / "examples" / "dc-spect-80.xlsx"
 BY_LIBREOFFICE = Path(__file__).parent / "files" / "dc-spect-80.xlsx"
 COLUMNS = {"d": "P", "R": "Q", "Ld": "S", "Td": "T"}
 
 
-def _truth() -> PinholeSystem:
-    """The contents of its cells, by openpyxl."""
+@functools.cache
+def truth() -> PinholeSystem:
+    """Return the scanner that the cells hold, by openpyxl."""
     book = openpyxl.load_workbook(REAL, data_only=True)
 
     def column(sheet: str, letters: str) -> np.ndarray:
@@ -34,11 +36,8 @@ def _truth() -> PinholeSystem:
     return PinholeSystem(centers, d, column("Coordinates", "G"), Ld, Td, R)
 
 
-TRUTH = _truth()
-
-
 def _saved(edit: Callable[[Workbook], object], data_only: bool = False) -> Callable[[Path], None]:
-    """Saved by openpyxl after an edit: formulas without values, or values alone."""
+    """Return a writer by openpyxl after an edit: formulas without values, or values alone."""
 
     def make(path: Path) -> None:
         book = openpyxl.load_workbook(REAL, data_only=data_only)
@@ -49,7 +48,7 @@ def _saved(edit: Callable[[Workbook], object], data_only: bool = False) -> Calla
 
 
 def _as_data() -> Book:
-    """Its cells, with the formulas and their stored values."""
+    """Return its cells, with the formulas and their stored values."""
     formulas, values = openpyxl.load_workbook(REAL), openpyxl.load_workbook(REAL, data_only=True)
     sheets = []
     for sheet in formulas.worksheets:
@@ -64,46 +63,38 @@ def _as_data() -> Book:
     return Book(sheets)
 
 
-def _more_columns(book: Workbook) -> None:
+def _extended(book: Workbook) -> None:
     for sheet in book.worksheets:
         for column, heading in (("Y", "serial"), ("Z", "checked by")):
             sheet[f"{column}2"] = heading
             for row in range(3, 83):
                 sheet[f"{column}{row}"] = f"{heading} {row}"
-
-
-def _more_sheets(book: Workbook) -> None:
     for name in ("MDSL cloud import", "Theta", "Values", "Design Table"):
-        sheet: Worksheet = book.create_sheet(name)
-        sheet.append(["case", "theta", "sum"])
-        sheet.append([1, 0.25, "=SUM(Coordinates!B3:B82)"])
+        added: Worksheet = book.create_sheet(name)
+        added.append(["case", "theta", "sum"])
+        added.append([1, 0.25, "=SUM(Coordinates!B3:B82)"])
 
 
 def _with_values(path: Path) -> None:
+    pytest.importorskip("xlsxwriter")
     by_xlsxwriter(_as_data(), path)
 
 
-def _cut(modules: int) -> Callable[[Workbook], None]:
-    def edit(book: Workbook) -> None:
-        for sheet in book.worksheets:
-            sheet.delete_rows(3 + modules, 80)
-
-    return edit
+def _cut(book: Workbook, modules: int) -> None:
+    for sheet in book.worksheets:
+        sheet.delete_rows(3 + modules, 80)
 
 
-CASES.add("as it is", lambda path: shutil.copy(REAL, path), TRUTH, RIGHT)
-CASES.add("saved by LibreOffice", lambda path: shutil.copy(BY_LIBREOFFICE, path), TRUTH, RIGHT)
-CASES.add("saved by openpyxl", _saved(lambda book: None), TRUTH, RIGHT)
-CASES.add("values alone", _saved(lambda book: None, data_only=True), TRUTH, RIGHT)
-CASES.add("written by hand", lambda path: by_hand(_as_data(), path), TRUTH, RIGHT)
-CASES.add("written by XlsxWriter with its values", _with_values, TRUTH, RIGHT, needs="xlsxwriter")
-CASES.add("more columns", _saved(_more_columns), TRUTH, RIGHT)
-CASES.add("more sheets", _saved(_more_sheets), TRUTH, RIGHT)
-CASES.add(
-    "more columns and sheets, values alone",
-    _saved(lambda book: (_more_columns(book), _more_sheets(book)), True),
-    TRUTH,
-    RIGHT,
-)
-for n in (1, 40):
-    CASES.add(f"{n} modules", _saved(_cut(n)), TRUTH[:n], RIGHT)
+STATES: dict[str, Callable[[Path], Any]] = {
+    "as it is": lambda path: shutil.copy(REAL, path),
+    "saved by LibreOffice": lambda path: shutil.copy(BY_LIBREOFFICE, path),
+    "saved by openpyxl": _saved(lambda book: None),
+    "values alone": _saved(lambda book: None, data_only=True),
+    "written by hand": lambda path: by_hand(_as_data(), path),
+    "written by XlsxWriter with its values": _with_values,
+    "more columns and sheets": _saved(_extended),
+    "more columns and sheets, values alone": _saved(_extended, data_only=True),
+    "1 modules": _saved(lambda book: _cut(book, 1)),
+    "40 modules": _saved(lambda book: _cut(book, 40)),
+}
+"""Writers of the workbook to a path, by the state that it is then in."""

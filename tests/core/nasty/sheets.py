@@ -52,7 +52,7 @@ class Rich:
 class Sheet:
     name: str
     cells: dict[str, Any] = field(default_factory=dict)
-    formats: dict[str, str] = field(default_factory=dict)  # cell -> number format
+    formats: dict[str, str | int] = field(default_factory=dict)  # cell -> number format, an int if Excel's own
     merged: list[str] = field(default_factory=list)
     notes: dict[str, str] = field(default_factory=dict)
     state: str = "visible"
@@ -77,53 +77,29 @@ class Sheet:
                 if value is not None:
                     self.cells[f"{get_column_letter(left + j)}{top + i}"] = value
 
-    def moved(self, down: int = 0, right: int = 0) -> None:
-        """Move all cells; formulas that refer to cells are not adapted."""
+    def moved(self, down: int = 0, right: int = 0, below: int = 0) -> None:
+        """Move the cells below a row; formulas that refer to cells are not adapted."""
 
         def at(cell: str) -> str:
             column, row = split(cell)
-            return f"{get_column_letter(column + right)}{row + down}"
+            return f"{get_column_letter(column + right)}{row + down}" if row > below else cell
 
         self.cells = {at(cell): value for cell, value in self.cells.items()}
         self.formats = {at(cell): value for cell, value in self.formats.items()}
-
-    @property
-    def last_row(self) -> int:
-        return max((split(at)[1] for at in self.cells), default=0)
 
 
 @dataclass
 class Book:
     sheets: list[Sheet]
     calculation: str = '<calcPr calcId="191029"/>'
-    date1904: bool = False
     names: dict[str, str] = field(default_factory=dict)
-    members: dict[str, bytes] = field(default_factory=dict)  # added to the file
-    edit: Callable[[dict[str, bytes]], dict[str, bytes]] | None = None  # of the members, before they are zipped
 
     def __getitem__(self, name: str) -> Sheet:
         return next(sheet for sheet in self.sheets if sheet.name == name)
 
-    def add(self, name: str, cells: dict[str, Any] | None = None, first: bool = False) -> Sheet:
-        sheet = Sheet(name, dict(cells or {}))
-        self.sheets.insert(0 if first else len(self.sheets), sheet)
-        return sheet
-
-    def replace(self, member: str, old: str, new: str, count: int = 1) -> None:
-        """Change a member's text before it is zipped; the text must be there."""
-        before = self.edit
-
-        def edit(members: dict[str, bytes]) -> dict[str, bytes]:
-            members = before(members) if before else members
-            text = members[member].decode()
-            assert old in text, f"{old!r} is not in {member}: {text[:500]}"
-            return {**members, member: text.replace(old, new, count).encode()}
-
-        self.edit = edit
-
 
 def split(at: str) -> tuple[int, int]:
-    """(column, row) of a cell's name."""
+    """Return the (column, row) of a cell's name."""
     letters, digits = re.fullmatch(r"([A-Z]+)(\d+)", at).groups()  # type: ignore[union-attr]
     return column_index_from_string(letters), int(digits)
 
@@ -136,12 +112,14 @@ _PACKAGE = "http://schemas.openxmlformats.org/package/2006"
 _XML = '<?xml version="1.0" encoding="UTF-8" standalone="yes"?>\n'
 _PART = "application/vnd.openxmlformats-officedocument.spreadsheetml."
 WORKBOOK_TYPE = _PART + "sheet.main+xml"
+Members = dict[str, bytes]
+"""The files in a workbook's zip archive."""
 
 
-def members_of(book: Book) -> dict[str, bytes]:
-    """The files in the zip archive, as Excel lays them out."""
+def members_of(book: Book) -> Members:
+    """Return the files in the zip archive, as Excel lays them out."""
     strings: dict[str, int] = {}
-    formats: dict[str, int] = {}
+    formats: dict[str | int, int] = {}
     parts: dict[str, str] = {}
     types: list[str] = []
     sheets, relations = [], []
@@ -169,9 +147,8 @@ def members_of(book: Book) -> dict[str, bytes]:
     ]
     names = "".join(f"<definedName name={quoteattr(k)}>{escape(v)}</definedName>" for k, v in book.names.items())
     names = f"<definedNames>{names}</definedNames>" if names else ""
-    dates = ' date1904="1"' if book.date1904 else ""
     parts["xl/workbook.xml"] = (
-        f'{_XML}<workbook xmlns="{_MAIN}" xmlns:r="{_RELATIONS}"><workbookPr{dates} defaultThemeVersion="166925"/>'
+        f'{_XML}<workbook xmlns="{_MAIN}" xmlns:r="{_RELATIONS}"><workbookPr defaultThemeVersion="166925"/>'
         f'<bookViews><workbookView activeTab="0"/></bookViews><sheets>{"".join(sheets)}</sheets>{names}'
         f"{book.calculation}</workbook>"
     )
@@ -192,7 +169,7 @@ def members_of(book: Book) -> dict[str, bytes]:
     )
     first = ("[Content_Types].xml", "_rels/.rels", "xl/workbook.xml")
     ordered = {name: parts.pop(name).encode() for name in first}
-    return ordered | {name: text.encode() for name, text in parts.items()} | book.members
+    return ordered | {name: text.encode() for name, text in parts.items()}
 
 
 def _relation(key: str, kind: str, target: str) -> str:
@@ -207,7 +184,7 @@ def _override(part: str, kind: str) -> str:
     return f'<Override PartName="{part}" ContentType="{_PART}{kind}+xml"/>'
 
 
-def _sheet_xml(sheet: Sheet, n: int, strings: dict[str, int], formats: dict[str, int]) -> str:
+def _sheet_xml(sheet: Sheet, n: int, strings: dict[str, int], formats: dict[str | int, int]) -> str:
     rows: dict[int, dict[int, str]] = {}
     for at, value in sheet.cells.items():
         if value is not None:
@@ -236,7 +213,9 @@ def _sheet_xml(sheet: Sheet, n: int, strings: dict[str, int], formats: dict[str,
     )
 
 
-def _cell_xml(at: str, value: Any, number_format: str | None, strings: dict[str, int], formats: dict[str, int]) -> str:
+def _cell_xml(
+    at: str, value: Any, number_format: str | int | None, strings: dict[str, int], formats: dict[str | int, int]
+) -> str:
     style = "" if number_format is None else f' s="{formats.setdefault(number_format, len(formats)) + 1}"'
     if isinstance(value, Raw):
         return value.xml
@@ -265,11 +244,13 @@ def _value_xml(value: Any) -> tuple[str, str]:
     return "", f"<v>{value!r}</v>"
 
 
-def _styles_xml(formats: dict[str, int]) -> str:
-    own = "".join(f'<numFmt numFmtId="{164 + i}" formatCode={quoteattr(code)}/>' for code, i in formats.items())
+def _styles_xml(formats: dict[str | int, int]) -> str:
+    ids = {code: code if isinstance(code, int) else 164 + i for code, i in formats.items()}
+    own = "".join(
+        f'<numFmt numFmtId="{ids[code]}" formatCode={quoteattr(code)}/>' for code in formats if isinstance(code, str)
+    )
     used = "".join(
-        f'<xf numFmtId="{164 + i}" fontId="0" fillId="0" borderId="0" xfId="0" applyNumberFormat="1"/>'
-        for i in formats.values()
+        f'<xf numFmtId="{i}" fontId="0" fillId="0" borderId="0" xfId="0" applyNumberFormat="1"/>' for i in ids.values()
     )
     plain = '<xf numFmtId="0" fontId="0" fillId="0" borderId="0" xfId="0"/>'
     return (
@@ -307,7 +288,7 @@ def _notes_xml(sheet: Sheet) -> str:
     return f'{_XML}<comments xmlns="{_MAIN}"><authors><author>A</author></authors>{notes}</comments>'
 
 
-def zipped(members: dict[str, bytes], compression: int = zipfile.ZIP_DEFLATED) -> bytes:
+def zipped(members: Members, compression: int = zipfile.ZIP_DEFLATED) -> bytes:
     file = io.BytesIO()
     with zipfile.ZipFile(file, "w", compression, compresslevel=1) as archive:
         for name, content in members.items():
@@ -316,15 +297,14 @@ def zipped(members: dict[str, bytes], compression: int = zipfile.ZIP_DEFLATED) -
 
 
 def by_hand(book: Book, path: Path) -> None:
-    members = members_of(book)
-    path.write_bytes(zipped(book.edit(members) if book.edit else members))
+    path.write_bytes(zipped(members_of(book)))
 
 
 # By other programs' libraries
 
 
 def by_xlsxwriter(book: Book, path: Path, **options: Any) -> None:
-    """With XlsxWriter: it asks for calculation on loading and stores 0 for a formula unless told its value."""
+    """Write with XlsxWriter, which asks for calculation on loading and stores 0 for a formula unless told its value."""
     import xlsxwriter
 
     with xlsxwriter.Workbook(path, {"strings_to_formulas": False, "strings_to_urls": False, **options}) as workbook:
@@ -333,6 +313,8 @@ def by_xlsxwriter(book: Book, path: Path, **options: Any) -> None:
             worksheet = workbook.add_worksheet(sheet.name)
             if sheet.state == "hidden":
                 worksheet.hide()
+            for at, text in sheet.notes.items():  # which lack in constant memory later on
+                worksheet.write_comment(at, text)
             for at, value in sorted(sheet.cells.items(), key=lambda item: split(item[0])[::-1]):
                 style = formats.get(sheet.formats.get(at, ""))
                 if isinstance(value, Formula):
@@ -343,8 +325,6 @@ def by_xlsxwriter(book: Book, path: Path, **options: Any) -> None:
                     worksheet.write(at, value, style)
                 elif value is not None:
                     raise TypeError(f"XlsxWriter does not write {value!r}")
-            for at, text in sheet.notes.items():
-                worksheet.write_comment(at, text)
             for area in sheet.merged:
                 at = area.split(":")[0]
                 worksheet.merge_range(area, sheet[at], formats.get(sheet.formats.get(at, "")))
@@ -355,7 +335,7 @@ def by_xlsxwriter(book: Book, path: Path, **options: Any) -> None:
 
 
 def by_openpyxl(book: Book, path: Path) -> None:
-    """With openpyxl: no formula has a stored value."""
+    """Write with openpyxl: no formula has a stored value."""
     import openpyxl
     from openpyxl.comments import Comment
     from openpyxl.workbook.defined_name import DefinedName

@@ -89,7 +89,8 @@ class CameraNets(Network):
     def _outputs(self, setup: ScannerSetup, images: Tensor, volumes: Tensor, cameras: Tensor) -> tuple[Tensor, Tensor]:
         """Return the camera network's outputs (B, V, F, n_x, n_y, n_z) for V cameras, and which voxels each camera sees.
 
-        `images` (B, V, 2, n_v, n_u) are the cameras' own, `volumes` (B, C, n_x, n_y, n_z) the same for all. The visibility (1, V, 1, n_x, n_y, n_z) is 1 where a camera sees a voxel, else 0.
+        `images` (B, V, 2, n_v, n_u) are the cameras' own, `volumes` (B, C, n_x, n_y, n_z) the same for all. The visibility
+        (1, V, 1, n_x, n_y, n_z) is 1 where a camera sees a voxel, else 0.
         """
         view_volumes = setup.maps.to_views(volumes, cameras)  # (B, V, volumes, n_u, n_v, n_k)
         n_k = view_volumes.shape[-1]

@@ -12,7 +12,6 @@ import pytest
 from mphdrr.addon.blender import storage
 from mphdrr.addon.phantoms import phantoms
 from mphdrr.addon.phantoms.phantom_properties import plain_settings
-from mphdrr.addon.scanner import scanner
 from mphdrr.addon.volumes import slices, stored_volumes, volume_materials, volumes
 from mphdrr.addon.volumes.stored_volumes import store_volume
 from mphdrr.addon.volumes.vdb import openvdb, write_vdb
@@ -293,8 +292,7 @@ def test_a_volume_begins_to_beat_and_stands_still_again(two_states):
     assert not item.data.is_sequence and volumes.file_of(item) == still, "files are named by content"
 
 
-def test_the_current_frame_is_projected(scene, ring_system, two_states):
-    scanner.build_scanner(scene, ring_system)
+def test_the_current_frame_is_projected(scene, ring, ring_system, two_states):
     volumes.add_volume(two_states, "Heart")
     views = ring_system.views(shape=(12, 10))
     for frame, expected in enumerate(two_states, 1):

@@ -268,8 +268,7 @@ def test_the_example_is_current(scene):
     assert runs.changes(scene) == ["Module 30 moved"] and runs.stale_modules(scene) == {30}
 
 
-def test_runs_from_outside_set_the_panel_and_say_what_the_scene_lacks(scene, ring_system, tmp_path):
-    collection = scanner.build_scanner(scene, ring_system)
+def test_runs_from_outside_set_the_panel_and_say_what_the_scene_lacks(scene, ring, ring_system, tmp_path):
     small = {"phantom.voxels": 12, "detector.rows": 6, "detector.columns": 8, "model.kind": "emission"}
     for number, (given, expected) in enumerate((
         ({}, []), ({"attenuation.of_phantom": True, "phantom.kind": "nema"}, ["attenuation of Nema phantom, now none"]),
@@ -280,7 +279,7 @@ def test_runs_from_outside_set_the_panel_and_say_what_the_scene_lacks(scene, rin
         rendering.show_run(scene, run, path, item)
         assert scene.mphdrr_projections.width == 8 and runs.changes(scene) == expected
     module(3).location.x += 1
-    assert runs.changes(scene)[0] == "Module 03 moved" and collection.mphdrr_scanner.count == 8
+    assert runs.changes(scene)[0] == "Module 03 moved" and ring.mphdrr_scanner.count == 8
 
 
 def test_a_volume_that_is_not_in_the_panel_is_found_again(render, scene):

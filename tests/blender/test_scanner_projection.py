@@ -170,26 +170,24 @@ def test_cameras_see_along_the_rays_of_the_views(scene, collection, tilted):
         assert np.allclose(seen, expected, atol=3e-6)
 
 
-def test_turning_a_camera_tilts_its_module_and_aiming_it_takes_the_tilt(scene, ring_system):
-    collection = scanner.build_scanner(scene, ring_system)
-    update()
-    camera = scanner.module(collection, 4)
+def test_turning_a_camera_tilts_its_module_and_aiming_it_takes_the_tilt(ring, ring_system):
+    camera = scanner.module(ring, 4)
     before = camera.rotation_euler.copy()
     camera.rotation_euler.y += 0.03
     camera.rotation_euler.x -= 0.02
     update()
-    read = scanner.read_scanner(collection)
+    read = scanner.read_scanner(ring)
     others = np.arange(8) != 3
     assert not read.tilt[others].any() and 0.03 < np.linalg.norm(read.tilt[3]) < 0.06
     assert np.array_equal(read.centers, ring_system.centers)
     assert np.allclose(read.poses()[3], cameras.module_poses(objects.world_matrix(camera)[None])[0], atol=1e-6)
-    assert scanner.losses(collection) == ["module 4 moved or turned"]
+    assert scanner.losses(ring) == ["module 4 moved or turned"]
     camera.rotation_euler = before
     update()
-    assert np.array_equal(scanner.read_scanner(collection).tilt, ring_system.tilt)
+    assert np.array_equal(scanner.read_scanner(ring).tilt, ring_system.tilt)
     camera.rotation_euler.y += 0.03
-    assert scanner.aim_modules(collection) == [4]
-    assert np.array_equal(scanner.read_scanner(collection).tilt, ring_system.tilt)
+    assert scanner.aim_modules(ring) == [4]
+    assert np.array_equal(scanner.read_scanner(ring).tilt, ring_system.tilt)
 
 
 def test_a_small_turn_of_a_tilted_module_is_not_lost_and_nothing_drifts(collection, tilted):

@@ -188,29 +188,19 @@ def test_hidden_parented_and_animated_modules(scene, collection):
     assert scanner.unaimed_numbers(collection, scanner.modules(collection)) == []
     assert_consistent(collection)
 
-    animated = scanner.module(collection, 6)
-    animated.parent = None
-    animated.keyframe_insert("location", frame=1)
-    animated.location.x += 30.0
-    animated.keyframe_insert("location", frame=20)
-    scene.frame_set(1)
-    rotation = animated.rotation_euler.copy()
-    scene.frame_set(10)
-    update()
-    assert animated.rotation_euler == rotation and not animated.mphdrr_module.aimed
-    assert_consistent(collection)
-
-    carried = scanner.module(collection, 7)
-    bench.keyframe_insert("location", frame=1)
-    bench.location.x += 25.0
-    bench.keyframe_insert("location", frame=20)
-    scene.frame_set(1)
-    update()
-    rotation = carried.rotation_euler.copy()
-    scene.frame_set(20)
-    update()
-    assert carried.rotation_euler == rotation and not carried.mphdrr_module.aimed
-    assert_consistent(collection)
+    alone, carried = (scanner.module(collection, number) for number in (6, 7))
+    alone.parent = None
+    for animated, camera in ((alone, alone), (bench, carried)):
+        animated.keyframe_insert("location", frame=1)
+        animated.location.x += 30.0
+        animated.keyframe_insert("location", frame=20)
+        scene.frame_set(1)
+        update()
+        rotation = camera.rotation_euler.copy()
+        scene.frame_set(10)
+        update()
+        assert camera.rotation_euler == rotation and not camera.mphdrr_module.aimed
+        assert_consistent(collection)
 
 
 def test_what_the_handler_writes_does_not_call_it_for_ever(collection):

@@ -25,12 +25,8 @@ from .conftest import refused, reopened
 
 
 @pytest.fixture
-def scanned(scene, ring_system):
+def scanned(derenzo):
     """A scanner, a phantom that is active, and a run of its projections."""
-    scanner.build_scanner(scene, ring_system, "Ring")
-    jobs.run(
-        phantoms.add_phantom_job(plain_settings("derenzo", voxels=16, rod_diameters=(10, 8, 0, 0, 0, 0)), "Derenzo")
-    )
     bpy.ops.mphdrr.render_projections(width=10, height=12)
 
 

@@ -106,6 +106,18 @@ def update() -> None:
     bpy.context.view_layer.update()
 
 
+def move(item: bpy.types.Object, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> None:
+    """Move an object by (x, y, z) mm, as a user does: the scene is up to date afterwards."""
+    item.location = np.add(item.location, (x, y, z))
+    update()
+
+
+def turn(item: bpy.types.Object, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> None:
+    """Add (x, y, z) radians to an object's Euler angles, as a user does: the scene is up to date afterwards."""
+    item.rotation_euler = np.add(item.rotation_euler, (x, y, z))
+    update()
+
+
 def select(*items: bpy.types.Object) -> None:
     """Select these objects alone; the first becomes active."""
     bpy.ops.object.select_all(action="DESELECT")

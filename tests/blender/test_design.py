@@ -15,7 +15,7 @@ from mphdrr.addon.scanner import collimators, following, live_scanner, module_ed
 from mphdrr.core.errors import InputError, InputWarning
 from mphdrr.core.geometry.system import PinholeSystem
 
-from .conftest import datablocks, part, refused, reopened, select, update
+from .conftest import datablocks, move, part, refused, reopened, select, update
 
 
 @pytest.fixture
@@ -80,8 +80,7 @@ def test_scanner_shows_what_it_does_as_soon_as_it_is_built(scene, collection, ro
 
 def test_moved_module_stays_aimed_and_its_length_follows(collection, roi_system):
     camera = scanner.module(collection, 3)
-    camera.location.z += 7.25
-    update()
+    move(camera, z=7.25)
     assert_consistent(collection)
     system = scanner.read_scanner(collection)
     assert scanner.unaimed_numbers(collection, [camera]) == [] and camera.mphdrr_module.aimed
@@ -153,13 +152,11 @@ def test_turning_is_left_to_the_user_and_moving_aims_again(collection):
     update()
     assert camera.rotation_euler == turned and not camera.mphdrr_module.aimed
     assert scanner.unaimed_numbers(collection, scanner.modules(collection)) == [4]
-    camera.location.z += 1.0
-    update()
+    move(camera, z=1.0)
     assert camera.mphdrr_module.aimed and scanner.unaimed_numbers(collection, [camera]) == []
     collection.mphdrr_scanner.keep_aimed = False
     rotation = camera.rotation_euler.copy()
-    camera.location.z += 1.0
-    update()
+    move(camera, z=1.0)
     assert camera.rotation_euler == rotation and not camera.mphdrr_module.aimed
     assert_consistent(collection)
     bpy.ops.mphdrr.aim_modules()
@@ -170,8 +167,7 @@ def test_hidden_parented_and_animated_modules(scene, collection):
     hidden = scanner.module(collection, 1)
     hidden.mphdrr_module.visible = False
     update()
-    hidden.location.z -= 9.0
-    update()
+    move(hidden, z=-9.0)
     assert hidden.mphdrr_module.aimed
     hidden.mphdrr_module.visible = True
     update()
@@ -206,8 +202,7 @@ def test_hidden_parented_and_animated_modules(scene, collection):
 def test_what_the_handler_writes_does_not_call_it_for_ever(collection):
     seen = []
     bpy.app.handlers.depsgraph_update_post.append(lambda scene, depsgraph: seen.append(len(depsgraph.updates)))
-    scanner.module(collection, 1).location.x += 1.0
-    update()
+    move(scanner.module(collection, 1), x=1.0)
     n = len(seen)
     update()
     update()
@@ -283,8 +278,7 @@ def test_blenders_own_duplicate_and_delete_are_tidied(collection):
     select(scanner.module(collection, 3))
     bpy.ops.object.duplicate()
     copy = bpy.context.view_layer.objects.active
-    copy.location.z += 40.0
-    update()
+    move(copy, z=40.0)
     assert collection.mphdrr_scanner.untidy == "1 copied camera"
     with pytest.raises(InputError, match="Tidy Modules"):
         scanner.read_scanner(collection)
@@ -379,8 +373,7 @@ def test_check_marks_the_modules_until_something_changes(collection):
     marked = {c.mphdrr_module.number for c in scanner.modules(collection) if c.mphdrr_module.finding}
     assert {1, 2} <= marked
     assert {o.mphdrr_module.number for o in bpy.context.selected_objects} == marked
-    second.location.x += 1.0
-    update()
+    move(second, x=1.0)
     assert second.mphdrr_module.finding == "" and collection.mphdrr_scanner.findings == ""
 
 

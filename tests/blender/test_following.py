@@ -17,7 +17,7 @@ from mphdrr.core.errors import InputError
 from mphdrr.core.geometry.grid import Grid
 from mphdrr.core.volumes.volume import Volume
 
-from .conftest import assert_same, part, reopened, select, update
+from .conftest import assert_same, move, part, reopened, select, update
 
 MOTION = Matrix.Translation((4.0, -9.0, 6.5)) @ Euler((0.1, -0.2, 0.3)).to_matrix().to_4x4()
 
@@ -53,8 +53,7 @@ def test_the_module_goes_where_a_part_is_put(collection, name):
     assert after.centers[2] == pytest.approx(list(MOTION @ before.translation), abs=1e-4)
     assert np.array_equal(np.delete(after.centers, 2, 0), np.delete(numbers, 2, 0))
     collection.mphdrr_scanner.keep_aimed = True
-    item.location.z += 2.0
-    update()
+    move(item, z=2.0)
     assert camera.mphdrr_module.aimed and scanner.unaimed_numbers(collection, [camera]) == []
 
 
@@ -122,16 +121,14 @@ def test_what_is_locked_animated_copied_or_moved_itself_is_respected(scene, coll
 
     camera.keyframe_insert("location", frame=1)
     place = camera.location.copy()
-    item.location.x += 5.0
-    update()
+    move(item, x=5.0)
     assert camera.location == place and np.array_equal(item.matrix_basis, np.eye(4))
 
     other = scanner.module(collection, 6)
     copy = part(other, "COLLIMATOR").copy()
     other.users_collection[0].objects.link(copy)
     place = objects.world_matrix(other)
-    copy.location.x += 20.0
-    update()
+    move(copy, x=20.0)
     assert np.array_equal(objects.world_matrix(other), place) and copy.location.x == 20.0
     assert planes.planes(scene)
 

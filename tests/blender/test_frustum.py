@@ -13,7 +13,7 @@ from mphdrr.addon.scanner import module_edits, scanner
 from mphdrr.addon.volumes import slices, volumes
 from mphdrr.core.runs.mosaic import as_seen
 
-from .conftest import cancelled, datablocks, refused, reopened, update
+from .conftest import cancelled, datablocks, move, refused, reopened, turn, update
 
 SHAPE = 18, 26  # rows, columns
 
@@ -143,12 +143,10 @@ def test_it_goes_with_its_module_and_says_what_is_not_true_any_more(shown, scene
         return [np.array(camera.matrix_world.inverted() @ layer.matrix_world) for layer in frustums.layers(frustum)]
 
     before = places()
-    camera.location.z += 20.0
-    update()
+    move(camera, z=20.0)
     np.testing.assert_allclose(places(), before, atol=1e-3)
     assert frustums.changes(scene, frustum) == "Module 03 has moved, or has other pixels"
-    camera.location.z -= 20.0
-    update()
+    move(camera, z=-20.0)
     assert frustums.changes(scene, frustum) == ""
     scene.mphdrr_projections.width = 30
     assert "other pixels" in frustums.changes(scene, frustum)
@@ -157,8 +155,7 @@ def test_it_goes_with_its_module_and_says_what_is_not_true_any_more(shown, scene
     shown.mphdrr_volume.display_high *= 0.5
     assert frustums.visible_volumes(scene) == []
     assert frustums.changes(scene, frustum) == "other colours of Derenzo"
-    shown.location.x += 4.0
-    update()
+    move(shown, x=4.0)
     assert frustums.changes(scene, frustum) == "other place and colours of Derenzo"
     frustum = show(3)
     assert frustums.changes(scene, frustum) == ""
@@ -168,9 +165,7 @@ def test_it_goes_with_its_module_and_says_what_is_not_true_any_more(shown, scene
 
 def test_a_module_that_is_turned_away_has_its_frustum_where_its_views_are(shown, scene, ring_system):
     camera = choose(3)
-    camera.rotation_euler.y += 0.05
-    camera.rotation_euler.z -= 0.04
-    update()
+    turn(camera, y=0.05, z=-0.04)
     frustum = show(2)
     assert frustum.parent == camera
     tilted = scanner.read_scanner(scanner.active_scanner(scene))

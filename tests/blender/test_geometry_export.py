@@ -17,7 +17,7 @@ from mphdrr.core.errors import InputError, InputWarning
 from mphdrr.core.exchange import FORMATS, read_geometry
 from mphdrr.core.workbook import read_system
 
-from .conftest import assert_same, refused, update
+from .conftest import assert_same, move, refused, update
 
 
 @pytest.fixture
@@ -126,8 +126,7 @@ def test_bad_paths_are_one_line_and_leave_the_scanner(collection, tmp_path):
 
 
 def test_changed_scanner_can_be_read_again_after_saving(scene, collection, tmp_path):
-    scanner.module(collection, 9).location.x += 4.0
-    update()
+    move(scanner.module(collection, 9), x=4.0)
     with pytest.raises(InputError, match="module 9 moved"):
         scanner.build_scanner(scene, read_system(tmp_path / "own.xlsx"), "own")
     path = tmp_path / "saved.xlsx"

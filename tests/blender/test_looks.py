@@ -166,8 +166,7 @@ def test_a_plane_that_the_user_deleted_leaves_the_others_as_they_are(nema):
     assert second.location.length > 0 and slices.plane_names(nema)[0] == ""
 
 
-def test_a_map_has_a_bar_in_the_unit_of_the_panels(scene, small_workbook):
-    bpy.ops.mphdrr.import_geometry(filepath=str(small_workbook))
+def test_a_map_has_a_bar_in_the_unit_of_the_panels(scene, imported):
     bpy.ops.mphdrr.add_map(quantity="sensitivity", voxels=9)
     item = bpy.data.objects["Sensitivity map"]
     middle = 1e6 * volumes.volume_from_object(item).array[4, 4, 4]

@@ -49,10 +49,9 @@ def test_bad_file_is_one_readable_line_and_leaves_the_scene(scene, tmp_path, nam
     assert datablocks("objects") == before and scanner.scanners(scene) == []
 
 
-def test_show_and_look_through(scene, small_workbook):
-    bpy.ops.mphdrr.import_geometry(filepath=str(small_workbook))
+def test_show_and_look_through(scene, imported):
     bpy.ops.mphdrr.show_modules(first=5, last=12, mode="ONLY")
-    found = scanner.modules(scanner.active_scanner(scene))
+    found = scanner.modules(imported)
     assert [o.mphdrr_module.number for o in found if not o.hide_render] == list(range(5, 13))
     bpy.ops.mphdrr.look_through_module(number=11)
     assert scene.camera.name == "Module 11"
@@ -60,8 +59,7 @@ def test_show_and_look_through(scene, small_workbook):
     refused(bpy.ops.mphdrr.show_modules, "no module between", first=100, last=120)
 
 
-def test_import_again_keeps_the_pictures_behind_cameras(scene, small_workbook):
-    bpy.ops.mphdrr.import_geometry(filepath=str(small_workbook))
+def test_import_again_keeps_the_pictures_behind_cameras(imported, small_workbook):
     picture = bpy.data.images.new("photo", 4, 4)
     camera = bpy.data.objects["Module 05"].data
     camera.show_background_images = True
@@ -164,33 +162,31 @@ def test_a_mixed_system_is_sorted_and_nothing_else_changes(scene, dc_spect, tmp_
     assert np.array_equal(mph.read_system(tmp_path / "mixed.xlsx").numbers, np.arange(1, 34))
 
 
-def test_added_and_removed_modules_get_the_numbers_between(scene, small_workbook, tmp_path):
-    bpy.ops.mphdrr.import_geometry(filepath=str(small_workbook))
-    collection = scanner.active_scanner(scene)
-    system = scanner.read_scanner(collection)
-    gone = [scanner.module(collection, n) for n in (3, 4, 15)]
-    scanner.module(collection, 7).name = "Mine"
-    scanner.module(collection, 14).mphdrr_module.pinhole_diameter = 2.5
-    module_edits.remove_modules(collection, gone)
-    (added,) = module_edits.duplicate_modules(collection, [scanner.module(collection, 16)], 1, np.radians(10.0), False)
+def test_added_and_removed_modules_get_the_numbers_between(scene, imported, tmp_path):
+    system = scanner.read_scanner(imported)
+    gone = [scanner.module(imported, n) for n in (3, 4, 15)]
+    scanner.module(imported, 7).name = "Mine"
+    scanner.module(imported, 14).mphdrr_module.pinhole_diameter = 2.5
+    module_edits.remove_modules(imported, gone)
+    (added,) = module_edits.duplicate_modules(imported, [scanner.module(imported, 16)], 1, np.radians(10.0), False)
     assert added.mphdrr_module.number == 17
-    module_edits.duplicate_modules(collection, [scanner.module(collection, 2)], 1, np.radians(10.0), False)
-    places = scanner.read_scanner(collection).centers[-2:]
+    module_edits.duplicate_modules(imported, [scanner.module(imported, 2)], 1, np.radians(10.0), False)
+    places = scanner.read_scanner(imported).centers[-2:]
     assert bpy.ops.mphdrr.renumber_modules() == {"FINISHED"}
-    read = scanner.read_scanner(collection)
+    read = scanner.read_scanner(imported)
     assert np.array_equal(read.numbers, np.arange(1, 16)) and read.source is None
     assert np.array_equal(read.centers[[14, 2]], places), "behind the ring's last module, and in the gap"
     others = np.delete(read.centers, [2, 14], axis=0)
     assert np.array_equal(others, np.delete(system.centers, [2, 3, 14], axis=0))
-    assert read.pinhole_diameter[12] == 2.5 and scanner.module(collection, 6).name == "Mine"
+    assert read.pinhole_diameter[12] == 2.5 and scanner.module(imported, 6).name == "Mine"
     # A further copy belongs to the scanner, whatever numbers its modules were imported with.
-    (copy,) = module_edits.duplicate_modules(collection, [scanner.module(collection, 1)], 1, np.radians(-9.0), False)
+    (copy,) = module_edits.duplicate_modules(imported, [scanner.module(imported, 1)], 1, np.radians(-9.0), False)
     assert copy.mphdrr_module.number == 16
     bpy.ops.mphdrr.export_geometry(filepath=str(tmp_path / "new.xlsx"))
     written = mph.read_system(tmp_path / "new.xlsx")
     assert np.array_equal(written.numbers, np.arange(1, 17))
     assert np.allclose(written.centers[:15], read.centers, atol=1e-9)
-    scanner.build_scanner(scene, written, collection.mphdrr_scanner.scanner_name, replace=True)
+    scanner.build_scanner(scene, written, imported.mphdrr_scanner.scanner_name, replace=True)
     assert len([o for o in scene.objects if o.type == "CAMERA" and o.mphdrr_module.is_module]) == 16
 
 

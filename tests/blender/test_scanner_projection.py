@@ -15,7 +15,7 @@ from mphdrr.core.geometry.collimator import Construction
 from mphdrr.core.geometry.system import PinholeSystem
 from mphdrr.core.geometry.views import Views
 
-from .conftest import assert_same, cycles_picture, reopened, update
+from .conftest import assert_same, cycles_picture, move, reopened, turn, update
 
 
 def project(views: Views, points: np.ndarray) -> np.ndarray:
@@ -139,9 +139,7 @@ def test_cameras_see_along_the_rays_of_the_views(scene, collection, tilted):
 def test_turning_a_camera_tilts_its_module_and_aiming_it_takes_the_tilt(ring, ring_system):
     camera = scanner.module(ring, 4)
     before = camera.rotation_euler.copy()
-    camera.rotation_euler.y += 0.03
-    camera.rotation_euler.x -= 0.02
-    update()
+    turn(camera, y=0.03, x=-0.02)
     read = scanner.read_scanner(ring)
     others = np.arange(8) != 3
     assert not read.tilt[others].any() and 0.03 < np.linalg.norm(read.tilt[3]) < 0.06
@@ -169,13 +167,11 @@ def test_a_small_turn_of_a_tilted_module_is_not_lost_and_nothing_drifts(collecti
 
 def test_a_tilted_module_that_is_only_moved_keeps_its_direction(collection, tilted):
     camera = scanner.module(collection, 2)
-    camera.location.z += 4.0
-    update()
+    move(camera, z=4.0)
     read = scanner.read_scanner(collection)
     assert np.allclose(read.frames()[1], tilted.frames()[1], rtol=0, atol=1e-12)
     collection.mphdrr_scanner.keep_aimed = True
-    camera.location.z += 1.0
-    update()
+    move(camera, z=1.0)
     assert not scanner.read_scanner(collection).tilt[1].any()
     assert np.array_equal(np.delete(scanner.read_scanner(collection).tilt, 1, 0), np.delete(tilted.tilt, 1, 0))
 

@@ -322,18 +322,19 @@ def test_the_numbers_of_the_only_volume_are_shown_whatever_is_selected(scene, ri
     assert all(plane.visible_get() for plane in planes)
 
 
-def test_panels_of_every_editor_draw_settings_and_buttons_that_exist(ring):
+def test_panels_of_every_editor_draw_settings_and_buttons_that_exist(scene, ring_system):
     def draw_all() -> int:
         return sum(len(drawn(True, space)) for space in {cls.bl_space_type for cls in PANELS})
 
     without = draw_all()
+    collection = scanner.build_scanner(scene, ring_system)
     bpy.ops.mphdrr.check_geometry()
     bpy.context.view_layer.objects.active = module(3)
     assert draw_all() > without
-    ring.objects.link(module(2).copy())
+    collection.objects.link(module(2).copy())
     update()
     module(1).mphdrr_module.pinhole_diameter = 500.0
-    ring.mphdrr_scanner.findings = '["a finding that is too long for one line of the sidebar"]'
+    collection.mphdrr_scanner.findings = '["a finding that is too long for one line of the sidebar"]'
     draw_all()
     for add in (bpy.ops.mphdrr.add_derenzo, bpy.ops.mphdrr.add_torso):
         assert add(voxels=12) == {"FINISHED"}

@@ -335,10 +335,9 @@ def test_duplicates_stand_along_the_ring(collection, roi_system):
     assert_consistent(collection)
     refused(bpy.ops.mphdrr.duplicate_modules, "place of another module", count=1, angle=0.0)
 
-    made = module_edits.duplicate_modules(
-        collection, [scanner.module(collection, 1)], 1, np.radians(30.0), follow_ring=True
-    )
-    x, y, z = scanner.read_module(collection, made[0]).centers[0]
+    first = [scanner.module(collection, 1)]
+    (copy,) = module_edits.duplicate_modules(collection, first, 1, np.radians(30.0), follow_ring=True)
+    x, y, z = scanner.read_module(collection, copy).centers[0]
     radii = np.hypot(*roi_system.centers[:2, :2].T)
     assert min(radii) < np.hypot(x, y) < max(radii) and z == pytest.approx(-30.0)
     update()

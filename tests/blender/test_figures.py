@@ -75,18 +75,6 @@ def test_a_rendered_figure_leaves_the_scene_as_it_was(example, tmp_path):
 
 
 @pytest.mark.long
-def test_a_volume_is_shown_in_its_look(example, tmp_path):
-    (item,) = volumes.volume_objects(example)
-    for look in ("DENSITY", "SHELL"):  # smoke, and a surface that is an object of its own
-        item.mphdrr_volume.look = look
-        before, path = state(), tmp_path / f"{look}.png"
-        draw("inside", path, (320, 240), labels=False, samples=1)
-        assert state() == before
-        shown = picture(path)
-        assert np.count_nonzero(shown[..., 0] - shown[..., 1] > 40) > 200, f"{look}: the phantom's purple"
-
-
-@pytest.mark.long
 def test_a_scanner_fits_its_figure_with_even_margins(example, tmp_path):
     for size in ((480, 240), (240, 420)):
         path = tmp_path / f"{size[0]}.png"
@@ -173,10 +161,15 @@ def test_a_picture_that_a_volume_does_not_change_is_warned_of(example, tmp_path,
 @pytest.mark.long
 @pytest.mark.parametrize("look", ["DENSITY", "SHELL"])
 def test_a_volume_is_seen_or_its_absence_is_said(example, tmp_path, look):
+    """As smoke, and as a surface that is an object of its own."""
     (item,) = volumes.volume_objects(example)
     item.mphdrr_volume.look, path = look, tmp_path / "a.png"
+    before = state()
     for kind in ("cut-away", "inside"):
-        assert draw(kind, path, (240, 150), samples=1) == []
+        assert draw(kind, path, (320, 240), labels=False, samples=1) == []
+    assert state() == before
+    shown = picture(path)
+    assert np.count_nonzero(shown[..., 0] - shown[..., 1] > 40) > 200, "the phantom's purple"
     item.mphdrr_volume.display_high = item.mphdrr_volume.surface = 1e7
     item.mphdrr_volume.display_low = 9e6
     (text,) = draw("inside", path, (240, 150), samples=1)

@@ -222,9 +222,8 @@ def test_map_is_the_cores_within_the_roi(imported):
     volume = volumes.volume_from_object(the_map())
     system = scanner.read_scanner(imported)
     expected = sensitivity_map(system, volume.grid).array
-    places = (
-        np.moveaxis(np.indices(volume.grid.shape), 0, -1) @ volume.grid.affine[:3, :3].T + volume.grid.affine[:3, 3]
-    )
+    affine = volume.grid.affine
+    places = np.moveaxis(np.indices(volume.grid.shape), 0, -1) @ affine[:3, :3].T + affine[:3, 3]
     inside = np.linalg.norm(places, axis=-1) <= system.roi_radius.max()
     assert np.array_equal(volume.array, np.where(inside, expected, 0))
     assert the_map().mphdrr_volume.unit == "cps/MBq"

@@ -198,9 +198,8 @@ def test_applied_pose_keeps_activity_and_projections(ring_system, scale):
     assert total(volume) == pytest.approx(phantom.total_activity * np.linalg.det(placed[:3, :3]), rel=1e-3)
     np.testing.assert_allclose(volumes.pose_of_object(item)[:3, :3], np.eye(3), atol=1e-6)
     np.testing.assert_allclose(volumes.pose_of_object(item)[:3, 3], placed[:3, 3], atol=1e-5)
-    np.testing.assert_allclose(
-        volume.grid.affine[:3, :3], np.diag(volume.grid.spacing), atol=1e-6 * volume.grid.spacing[0]
-    )
+    spacing = volume.grid.spacing
+    np.testing.assert_allclose(volume.grid.affine[:3, :3], np.diag(spacing), atol=1e-6 * spacing[0])
     mu = volumes.volume_from_object(item.children[0])
     np.testing.assert_allclose(mu.grid.affine, volume.grid.affine, atol=1e-5)
     assert mu.array.max() == pytest.approx(largest_mu)

@@ -117,9 +117,8 @@ def test_the_panel_untouched_gives_each_method_its_own_defaults(name, scene):
     assert given.pop("method", "osem") == name
     assert all(value == own[each] for each, value in given.items() if each in own)
     assert own.keys() - {"prior", "weight"} <= dict(panel_properties(panel)).keys()
-    assert f"OSEM 10, MLEM 50, BSREM 30, SIRT {METHODS['sirt'].own['iterations']}" in (
-        panel.bl_rna.properties["iterations"].description
-    )
+    description = panel.bl_rna.properties["iterations"].description
+    assert f"OSEM 10, MLEM 50, BSREM 30, SIRT {METHODS['sirt'].own['iterations']}" in description
 
 
 @pytest.mark.long
@@ -216,9 +215,8 @@ def job_of(scene) -> jobs.Job:
     panel = scene.mphdrr_reconstruction
     for name, value in SMALL.items():
         setattr(panel, name, value)
-    return reconstructions.reconstruct_job(
-        bpy.context, settings_recipe(lambda name: getattr(panel, name), lambda name: False)
-    )
+    recipe = settings_recipe(lambda name: getattr(panel, name), lambda name: False)
+    return reconstructions.reconstruct_job(bpy.context, recipe)
 
 
 def test_it_is_shown_while_it_runs_and_cancelled_without_a_trace(render, scene, in_window):
@@ -310,9 +308,8 @@ def test_the_scenes_attenuation_is_modelled_and_missed(render, scene):
 def test_the_panel_draws_the_result(render, scene):
     bpy.ops.mphdrr.reconstruct(**SMALL | {"spacing": 4.0})  # not much more than that of the run
     texts = Drawn("MPHDRR_PT_reconstruction").texts
-    assert {"OSEM, 3 iterations", "Log-likelihood", "NRMSE", "Show Slices", "Continue (+10)", "Reconstruct"} <= set(
-        texts
-    )
+    shown = {"OSEM, 3 iterations", "Log-likelihood", "NRMSE", "Show Slices", "Continue (+10)", "Reconstruct"}
+    assert shown <= set(texts)
     assert any(text.startswith("8 mm") for text in texts)
     flatters = " ".join(scene.mphdrr_reconstruction.details["flatters"])
     assert flatters and set(flatters.split()) <= set(" ".join(texts).split()), "the warning stays with the score"

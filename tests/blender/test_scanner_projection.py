@@ -178,9 +178,8 @@ def test_a_tilted_module_that_is_only_moved_keeps_its_direction(collection, tilt
 
 def test_copies_along_the_ring_keep_the_tilt(collection, tilted):
     for follow_ring in (False, True):
-        (copy,) = module_edits.duplicate_modules(
-            collection, [scanner.module(collection, 3)], 1, 0.21 + follow_ring / 10, follow_ring
-        )
+        third, angle = [scanner.module(collection, 3)], 0.21 + follow_ring / 10
+        (copy,) = module_edits.duplicate_modules(collection, third, 1, angle, follow_ring)
         assert np.allclose(scanner.read_module(collection, copy).tilt, tilted.tilt[2], rtol=0, atol=1e-12)
 
 

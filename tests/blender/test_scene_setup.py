@@ -69,10 +69,8 @@ def test_cameras_that_were_edited_are_named_until_they_are_reset(ring, monkeypat
         assert "reset_cameras" in said() and "of 1 camera" in said(), name
         assert bpy.ops.mphdrr.reset_cameras() == {"FINISHED"}
         assert "reset_cameras" not in said(), name
-        module = camera.mphdrr_module
-        assert camera.data.lens / camera.data.sensor_width == pytest.approx(
-            module.collimator_length / module.detector_side, rel=1e-6
-        )
+        ratio = camera.mphdrr_module.collimator_length / camera.mphdrr_module.detector_side
+        assert camera.data.lens / camera.data.sensor_width == pytest.approx(ratio, rel=1e-6)
     camera.data.lens = 77.0
     camera.mphdrr_module.collimator_length = 61.0
     assert camera.data.lens == pytest.approx(61.0), "it follows l"
@@ -134,7 +132,6 @@ def test_lines_of_sight_are_those_of_the_cameras(scene, ring, ring_system):
     assert [len(drawn[name]) for name in ("show_rays", "show_frustums", "show_detectors")] == [7, 28, 28]
     for m, camera in enumerate(scanner.modules(ring)[1:]):
         seen = [world_to_camera_view(scene, camera, Vector(p)) for p in drawn["show_detectors"][4 * m : 4 * m + 4, 0]]
-        assert np.allclose(
-            sorted(p[:2] for p in np.round(seen, 3).tolist()), [(0, 0), (0, 1), (1, 0), (1, 1)], atol=2e-3
-        )
+        ends = sorted(p[:2] for p in np.round(seen, 3).tolist())
+        assert np.allclose(ends, [(0, 0), (0, 1), (1, 0), (1, 1)], atol=2e-3)
         assert np.allclose([p.z for p in seen], 10 * camera.mphdrr_module.collimator_length, rtol=1e-5)

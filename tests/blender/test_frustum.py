@@ -118,7 +118,9 @@ def test_what_is_low_is_transparent_and_colours_are_those_of_slices():
 def test_ct_numbers_are_air_outside_their_grid(ring_system):
     grid = mph.Grid.centered((9, 8, 7), 6.0)
     values = np.random.default_rng(3).uniform(-1000, 800, grid.shape).astype(np.float32)
-    g = grid_of_volume(grid, ring_system)
+    views = ring_system[4:5].views((12, 10))
+    (near,), (far,) = mph.depth_ranges(views, grid)
+    g = mph.PerspectiveGrid(views, 0, 8, near, far)
     found = frustums.to_module_cells(mph.Volume(values, grid, "hu"), g)
     np.testing.assert_allclose(found, mph.to_perspective(values + 1000, g, grid=grid) - 1000, atol=1e-3)
     back = frustums.to_voxels(found, g, mph.Volume(values, grid, "hu"))
@@ -127,17 +129,10 @@ def test_ct_numbers_are_air_outside_their_grid(ring_system):
     assert np.all(air == -1000) and np.all(frustums.to_voxels(air, g, mph.Volume(values, grid, "hu")).array == -1000)
 
 
-def grid_of_volume(grid: mph.Grid, system) -> mph.PerspectiveGrid:
-    views = system[4:5].views((12, 10))
-    near, far = mph.depth_ranges(views, grid)
-    return mph.PerspectiveGrid(views, 0, 8, near[0], far[0])
-
-
 def test_it_goes_with_its_module_and_says_what_is_not_true_any_more(shown, scene):
     frustum = show(3)
     assert frustums.changes(scene, frustum) == ""
     camera = frustum.parent
-    update()
 
     def places() -> list[np.ndarray]:
         return [np.array(camera.matrix_world.inverted() @ layer.matrix_world) for layer in frustums.layers(frustum)]

@@ -14,6 +14,8 @@ import pytest
 
 bpy = pytest.importorskip("bpy", reason="needs Blender's Python module: pip install mphdrr[blender]")
 
+from mathutils import Matrix  # noqa: E402
+
 from mphdrr.addon import registration  # noqa: E402
 from mphdrr.addon.blender import jobs, plots, timers  # noqa: E402
 from mphdrr.addon.events import event_notes  # noqa: E402
@@ -22,6 +24,8 @@ from mphdrr.addon.runs import preview  # noqa: E402
 from mphdrr.addon.scanner import scanner  # noqa: E402
 from mphdrr.core.geometry.scanner import Scanner  # noqa: E402
 from mphdrr.core.geometry.system import PinholeSystem  # noqa: E402
+from mphdrr.core.progress import Cancelled  # noqa: E402
+from mphdrr.core.volumes.volume import Volume  # noqa: E402
 from mphdrr.core.workbook import read_system, write_system  # noqa: E402
 
 WORKBOOK = Path(__file__).parents[2] / "examples" / "dc-spect-80.xlsx"
@@ -102,6 +106,18 @@ def update() -> None:
     bpy.context.view_layer.update()
 
 
+def move(item: bpy.types.Object, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> None:
+    """Move an object by (x, y, z) mm, as a user does: the scene is up to date afterwards."""
+    item.location = np.add(item.location, (x, y, z))
+    update()
+
+
+def turn(item: bpy.types.Object, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> None:
+    """Add (x, y, z) radians to an object's Euler angles, as a user does: the scene is up to date afterwards."""
+    item.rotation_euler = np.add(item.rotation_euler, (x, y, z))
+    update()
+
+
 def select(*items: bpy.types.Object) -> None:
     """Select these objects alone; the first becomes active."""
     bpy.ops.object.select_all(action="DESELECT")
@@ -135,6 +151,17 @@ def refused(operator: Callable[..., Any], words: str, **arguments: Any) -> None:
     assert len(str(refusal.value).strip().splitlines()) == 1 and "context is incorrect" not in str(refusal.value)
 
 
+def cancelled(job: jobs.Job, condition: Callable[[int, int], bool]) -> None:
+    """Run a job until its progress (done, total) meets the condition, and check that it is cancelled there."""
+
+    def progress(done: int, total: int) -> None:
+        if condition(done, total):
+            raise Cancelled
+
+    with pytest.raises(Cancelled):
+        jobs.run(job, progress)
+
+
 def assert_same(one: Scanner, other: Scanner, tolerance: float = 0.0) -> None:
     """Check that two scanners are of one kind and have the same numbers and values."""
     assert type(one) is type(other) and one.numbers.tolist() == other.numbers.tolist()
@@ -143,6 +170,12 @@ def assert_same(one: Scanner, other: Scanner, tolerance: float = 0.0) -> None:
             np.testing.assert_allclose(values, other.values()[name], rtol=tolerance, atol=tolerance, err_msg=name)
         else:
             np.testing.assert_array_equal(values, other.values()[name], err_msg=name)
+
+
+def centroid(volume: Volume) -> np.ndarray:
+    """Return the centroid (x, y, z) of a volume's values in the world, mm."""
+    index = np.average(np.argwhere(np.ones(volume.grid.shape)), axis=0, weights=volume.array.ravel().astype(float))
+    return volume.grid.affine[:3] @ [*index, 1.0]
 
 
 def datablocks(*kinds: str) -> dict[str, list[str]]:
@@ -161,6 +194,48 @@ def pixels(image: bpy.types.Image) -> np.ndarray:
     values = np.empty(4 * image.size[0] * image.size[1], np.float32)
     image.pixels.foreach_get(values)
     return values.reshape(image.size[1], image.size[0], 4)
+
+
+def slice_pixels(plane: bpy.types.Object) -> np.ndarray:
+    """Return the colours that a slice of a volume shows, as `pixels` does."""
+    return pixels(plane.data.materials[0].node_tree.nodes["Slice"].image)
+
+
+def cycles_picture(scene: bpy.types.Scene, samples: int) -> np.ndarray:
+    """Render the scene in no world's light by Cycles, and return its linear colours as `pixels` does."""
+    scene.world = None
+    scene.render.engine, scene.render.resolution_percentage = "CYCLES", 100
+    scene.cycles.samples, scene.cycles.use_denoising = samples, False
+    scene.view_settings.view_transform = "Raw"
+    scene.render.image_settings.file_format, scene.render.image_settings.color_depth = "OPEN_EXR", "32"
+    scene.render.filepath = str(Path(bpy.app.tempdir, "picture.exr"))
+    bpy.ops.render.render(write_still=True)
+    image = bpy.data.images.load(scene.render.filepath)
+    colors = pixels(image)
+    bpy.data.images.remove(image)
+    return colors
+
+
+def volume_picture(
+    scene: bpy.types.Scene, axes: tuple[int, int], aim: np.ndarray, width: float, side: int, samples: int
+) -> np.ndarray:
+    """Render the scene's volumes alone as `cycles_picture`, by an orthographic camera.
+
+    The picture has `side` x `side` pixels and is `width` mm wide around `aim`; the world axes `axes` lead to its right
+    and upwards.
+    """
+    bpy.data.batch_remove([item for item in scene.objects if item.type != "VOLUME"])
+    scene.camera = bpy.data.objects.new("Camera", bpy.data.cameras.new("Camera"))
+    scene.collection.objects.link(scene.camera)
+    camera = scene.camera.data
+    camera.type, camera.ortho_scale, camera.clip_end = "ORTHO", width, 1000.0
+    right, up = np.eye(3)[list(axes)]
+    back = np.cross(right, up)
+    pose = np.eye(4)
+    pose[:3] = np.stack([right, up, back, aim + 200.0 * back], axis=1)
+    scene.camera.matrix_world = Matrix(pose)
+    scene.render.resolution_x = scene.render.resolution_y = side
+    return cycles_picture(scene, samples)
 
 
 class Drawn:

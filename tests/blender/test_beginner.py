@@ -243,8 +243,7 @@ def press() -> str:
     return step.text
 
 
-def test_what_is_proposed_leads_to_a_score(scene, small_workbook):
-    bpy.ops.mphdrr.import_geometry(filepath=str(small_workbook))
+def test_what_is_proposed_leads_to_a_score(scene, imported):
     settings, reconstruction = scene.mphdrr_projections, scene.mphdrr_reconstruction
     settings.width = settings.height = reconstruction.voxels = 12
     reconstruction.method = "SIRT"  # without a window, what is chosen by the run is the default

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import json
 import re
 from pathlib import Path
@@ -19,7 +20,7 @@ from mphdrr.core.geometry.columns import LENGTH_UNITS, Column
 from mphdrr.core.geometry.system import PinholeSystem
 from mphdrr.core.workbook import ColumnMap, draft_column_map, read_system
 
-from .conftest import Drawn, refused, reopened, update
+from .conftest import Drawn, assert_same, refused, reopened, update
 
 CM = {"x1": "Mitte x (Zentimeter)", "y1": "Mitte y (Zentimeter)", "z1": "Mitte z (Zentimeter)"}
 
@@ -87,23 +88,10 @@ def quantity(form, name):
     return next(quantity for quantity in form.quantities if quantity.name == name)
 
 
-def assert_equal(one: PinholeSystem, other: PinholeSystem) -> None:
-    np.testing.assert_array_equal(one.numbers, other.numbers)
-    for name in PinholeSystem.columns.typed:
-        column = PinholeSystem.columns[name]
-        if column.is_text:
-            np.testing.assert_array_equal(column.values(one), column.values(other))
-        else:
-            np.testing.assert_allclose(column.values(one), column.values(other), rtol=1e-9, atol=1e-9)
+assert_equal = functools.partial(assert_same, tolerance=1e-9)
 
 
 # The settings
-
-
-def test_settings_say_what_the_map_says(form, unread, columns):
-    assert column_maps.fill(form, unread, columns)
-    assert column_maps.column_map(form) == columns
-    assert form.refusal == ""
 
 
 def test_the_draft_of_an_understood_workbook_needs_no_more(form, workbook):
@@ -113,13 +101,14 @@ def test_the_draft_of_an_understood_workbook_needs_no_more(form, workbook):
     assert_equal(read_system(workbook, column_maps.accept(form)), read_system(workbook))
 
 
-def test_every_setting_of_a_table_survives(form, unread, columns):
+def test_settings_say_what_the_map_says(form, unread, columns):
     pinholes, dimensions = columns.tables
     one = dataclasses.replace(dimensions, first_row=9, last_row=9, rows="one for all", number=None)
     odd = ColumnMap((dataclasses.replace(pinholes, skip_rows=(5, 9, 10), header_row=None), one))
-    column_maps.fill(form, unread, odd)
-    assert column_maps.column_map(form) == odd
-    assert json.loads(form.preview)[0][0] == "Module"
+    for column_map in (columns, odd):
+        assert column_maps.fill(form, unread, column_map)
+        assert column_maps.column_map(form) == column_map
+        assert form.refusal == "" and json.loads(form.preview)[0][0] == "Module"
 
 
 def test_what_is_missing_is_asked_for_and_then_read(form, unread, small):
@@ -223,38 +212,19 @@ def map_file(tmp_path, columns) -> Path:
 
 
 def test_a_refused_workbook_names_the_way_and_a_map_reads_it(scene, unread, map_file, columns, small):
-    refused(
-        bpy.ops.mphdrr.import_geometry,
-        r"a column map can say what is meant \(columns='map\.toml'",
-        filepath=str(unread),
-    )
+    """Also when it is repeated by Adjust Last Operation, which runs the operator with the properties that it had."""
+    for words, arguments in (
+        (r"a column map can say what is meant \(columns='map\.toml'", {}),
+        (r"set columns to a column map \(\.toml\) instead", {"choose_columns": True}),  # no dialog without a window
+        (r"none\.toml: no such file", {"columns": str(map_file.with_name("none.toml"))}),
+    ):
+        refused(bpy.ops.mphdrr.import_geometry, words, filepath=str(unread), **arguments)
     assert scanner.scanners(scene) == []
-    assert bpy.ops.mphdrr.import_geometry(filepath=str(unread), columns=str(map_file)) == {"FINISHED"}
-    collection = scanner.active_scanner(scene)
-    assert_equal(scanner.read_scanner(collection), small)
-    assert scanner.read_scanner(collection).source.columns == columns
-
-
-def test_an_import_that_is_repeated_does_not_ask_again(scene, unread, columns):
-    """As by Adjust Last Operation, which runs the operator with the properties that it had."""
-    asked = {"choose_columns": True, "chosen_columns": columns.to_toml()}
-    assert bpy.ops.mphdrr.import_geometry(filepath=str(unread), **asked) == {"FINISHED"}
-    assert scanner.source(scanner.active_scanner(scene)).columns == columns
-
-
-def test_a_script_is_told_that_a_dialog_needs_a_window(unread, map_file):
-    refused(
-        bpy.ops.mphdrr.import_geometry,
-        r"set columns to a column map \(\.toml\) instead",
-        filepath=str(unread),
-        choose_columns=True,
-    )
-    refused(
-        bpy.ops.mphdrr.import_geometry,
-        r"none\.toml: no such file",
-        filepath=str(unread),
-        columns=str(map_file.with_name("none.toml")),
-    )
+    for arguments in ({"columns": str(map_file)}, {"choose_columns": True, "chosen_columns": columns.to_toml()}):
+        assert bpy.ops.mphdrr.import_geometry(filepath=str(unread), replace=True, **arguments) == {"FINISHED"}
+        collection = scanner.active_scanner(scene)
+        assert_equal(scanner.read_scanner(collection), small)
+        assert scanner.read_scanner(collection).source.columns == columns
 
 
 # Writing back
@@ -274,8 +244,7 @@ def test_an_unchanged_scanner_writes_the_same_file(collection, unread, tmp_path)
 @pytest.mark.parametrize("saved", [False, True])
 def test_a_changed_scanner_is_written_by_its_map_in_the_files_unit(saved, collection, scene, tmp_path):
     if saved:
-        scene = reopened(tmp_path / "scene.blend")
-        collection = scanner.active_scanner(scene)
+        collection = scanner.active_scanner(reopened(tmp_path / "scene.blend"))
     scanner.module(collection, 7).location.x += 3.0
     scanner.module(collection, 9).mphdrr_module.pinhole_diameter = 2.5
     path = tmp_path / "edited.xlsx"
@@ -360,9 +329,7 @@ def test_they_are_read_exactly_edited_and_kept(typed, tmp_path):
     module.shim_thickness, module.hole_coating, module.crystal_batch = 0.7, "none", "Ü 7"
     module.crystal_material = "CsI"
     expected[2] = 0.7
-    path = str(tmp_path / "columns.blend")
-    reopened(path)
-    opened = scanner.active_scanner(bpy.context.scene)
+    opened = scanner.active_scanner(reopened(tmp_path / "columns.blend"))
     read = scanner.read_scanner(opened)
     assert np.array_equal(read.shim_thickness, expected)
     assert read.hole_coating.tolist() == ["gold"] * 2 + ["none"] + ["gold"] * 5

@@ -63,19 +63,16 @@ def test_scene_command_takes_a_volume_of_mu(tmp_path, workbook):
 
 
 def test_scene_command_refuses_in_one_line(tmp_path, workbook, capsys):
-    assert main(["scene", str(workbook), "-o", str(tmp_path / "scanner.txt")]) == 1
-    said = capsys.readouterr().err
-    assert said.count("\n") == 1
-    assert "expected a name ending in .blend" in said
-    assert not list(tmp_path.iterdir())
-
-
-def test_scene_command_refuses_activity_as_mu(tmp_path, workbook, capsys):
-    mph.write_volume(mph.Volume(np.ones((2, 2, 2)), mph.Grid.centered(2, 1.0), "activity"), tmp_path / "a.nii")
-    words = ["scene", workbook, "--mu", tmp_path / "a.nii", "-o", tmp_path / "s.blend"]
-    assert main(list(map(str, words))) == 1
-    assert "a.nii: it holds activity, expected mu in 1/mm" in capsys.readouterr().err
-    assert not (tmp_path / "s.blend").exists()
+    volume = tmp_path / "a.nii"
+    mph.write_volume(mph.Volume(np.ones((2, 2, 2)), mph.Grid.centered(2, 1.0), "activity"), volume)
+    for name, options, words in (
+        ("s.txt", [], "expected a name ending in .blend"),
+        ("s.blend", ["--mu", str(volume)], "a.nii: it holds activity, expected mu in 1/mm"),
+    ):
+        assert main(["scene", str(workbook), *options, "-o", str(tmp_path / name)]) == 1
+        said = capsys.readouterr().err
+        assert said.count("\n") == 1 and words in said
+    assert list(tmp_path.iterdir()) == [volume]
 
 
 @pytest.mark.long

@@ -17,15 +17,14 @@ from mphdrr.core.runs.display import Display
 from mphdrr.core.runs.mosaic import as_seen
 from mphdrr.core.volumes.volume import Volume
 
-from .conftest import reopened, update
+from .conftest import pixels, reopened, update
 
 POINT = np.array([9.0, -6.0, 12.0])
 
 
 @pytest.fixture
-def projected(scene, ring_system):
+def projected(scene, ring):
     """A scanner of eight modules and what they see of a small source that is off every axis."""
-    scanner.build_scanner(scene, ring_system, "Ring")
     volumes.add_volume(Volume(np.ones((2, 2, 2), np.float32), Grid.centered(2, 2.0, POINT)), "Point")
 
     def project(**settings):
@@ -38,11 +37,9 @@ def projected(scene, ring_system):
 
 def brightest(picture: bpy.types.Image) -> tuple[float, float]:
     """Place of the brightest pixel of a picture, from 0 to 1 to the right and upwards."""
-    width, height = picture.size
-    pixels = np.empty(4 * width * height, np.float32)
-    picture.pixels.foreach_get(pixels)
-    row, column = np.unravel_index(pixels.reshape(height, width, 4)[..., :3].sum(axis=-1).argmax(), (height, width))
-    return (column + 0.5) / width, (row + 0.5) / height
+    values = pixels(picture)[..., :3].sum(axis=-1)
+    row, column = np.unravel_index(values.argmax(), values.shape)
+    return (column + 0.5) / values.shape[1], (row + 0.5) / values.shape[0]
 
 
 @pytest.mark.parametrize("detector", ["VIRTUAL", "REAL"])
@@ -84,13 +81,11 @@ def test_the_display_changes_pictures_and_leaves_numbers(projected, scene):
     for edit in ({"colors": "GREY"}, {"scale": "LOG"}, {"high": 0.25 * before.max()}, {"automatic": False}):
         for setting, value in edit.items():
             setattr(settings, setting, value)
-        pixels = np.empty(4 * before.size, np.float32)
-        bpy.data.images[picture].pixels.foreach_get(pixels)
-        everything.append(pixels)
+        everything.append(pixels(bpy.data.images[picture]))
         assert images.projection_array(bpy.data.images[name]).tobytes() == before.tobytes(), "to the last bit"
-    assert len({pixels.tobytes() for pixels in everything}) == 3, "a window that is automatic does not follow High"
+    assert len({colors.tobytes() for colors in everything}) == 3, "a window that is automatic does not follow High"
     expected = Display("grey", "log", settings.low, settings.high).colored(as_seen(before))
-    np.testing.assert_array_equal(np.rint(everything[-1].reshape(40, 50, 4)[::-1, :, :3] * 255), expected)
+    np.testing.assert_array_equal(np.rint(everything[-1][::-1, :, :3] * 255), expected)
     settings.low = settings.high + 1
     assert settings.problem and np.array_equal(images.projection_array(bpy.data.images[name]), before)
 
@@ -141,34 +136,27 @@ def test_the_central_half_is_a_run_of_half_the_side(projected, scene, detector):
     def pictures():
         update()
         made = planes.planes(scene)
-        pixels = [np.array(bpy.data.images[ids.picture_name(f"mphDRR 0{n}")].pixels) for n in (2, 7)]
-        views = [
-            (background.scale, *background.offset)
-            for plane in made
-            for background in plane.parent.data.background_images
-        ]
-        return pixels, [np.array(plane.matrix_world) * plane.empty_display_size for plane in made], views
+        colors = [pixels(bpy.data.images[f"mphDRR 0{n} picture"]) for n in (2, 7)]
+        backgrounds = [background for plane in made for background in plane.parent.data.background_images]
+        views = [(background.scale, *background.offset) for background in backgrounds]
+        return colors, [np.array(plane.matrix_world) * plane.empty_display_size for plane in made], views
 
     projected(detector=detector, width=40, pitch=2.0)
-    (first, of_seven), places, views = pictures()
+    first, places, views = pictures()
     bpy.ops.mphdrr.render_projections(width=80, height=80, detector=detector, pitch=2.0)
     wide = pictures()
     assert wide[2][0][0] == pytest.approx(2 * views[0][0])
     exact = images.projection_array(bpy.data.images["mphDRR 07"])
     settings.half = True
-    (second, of_seven_now), places_now, views_now = pictures()
-    np.testing.assert_allclose(second, first, atol=1e-2)
-    np.testing.assert_allclose(of_seven_now, of_seven, atol=1e-2)
-    np.testing.assert_allclose(views_now, views, atol=1e-6)
-    np.testing.assert_allclose(places_now, places, atol=1e-3)
+    for now, before, tolerance in zip(pictures(), (first, places, views), (1e-2, 1e-3, 1e-6), strict=True):
+        np.testing.assert_allclose(now, before, atol=tolerance)
     assert np.array_equal(images.projection_array(bpy.data.images["mphDRR 07"]), exact) and exact.shape == (80, 80)
     # The eyedropper counts columns and rows in the whole array.
     for name, at in (("mphDRR 07 picture", (0.01, 0.01)), ("mphDRR 07", (0.51 * 0.5 + 0.25, 0.25))):
         found = tiles.value_at(bpy.data.images[name], *at)
         column, row = (int(word.rstrip(",")) for word in found[0].split()[3::2])
         assert found[1] == exact[row, column]
-    found = tiles.value_at(bpy.data.images["mphDRR 07 picture"], 0.01, 0.01)
-    assert found[0] == "mphDRR 07, column 59, row 20"
+    assert tiles.value_at(bpy.data.images["mphDRR 07 picture"], 0.01, 0.01)[0] == "mphDRR 07, column 59, row 20"
     shown = images.tiles(bpy.data.images[ids.MOSAIC])
     row, column = np.reshape(shown["corners"], (-1, 2))[6]
     mosaic = bpy.data.images[ids.MOSAIC]
@@ -270,18 +258,16 @@ def shows(display: Display) -> bool:
     found = [images.projection_array(bpy.data.images[ids.projection_name(k, 8)]) for k in range(1, 9)]
     window = display.window(np.stack(found))
     for number, exact in enumerate(found, 1):
-        picture = bpy.data.images[ids.picture_name(ids.projection_name(number, 8))]
-        pixels = np.array(picture.pixels[:]).reshape(*exact.shape, 4)[::-1, :, :3]
-        if not np.array_equal(np.rint(255 * pixels), display.colored(as_seen(exact), window)):
+        colors = pixels(bpy.data.images[ids.picture_name(ids.projection_name(number, 8))])[::-1, :, :3]
+        if not np.array_equal(np.rint(255 * colors), display.colored(as_seen(exact), window)):
             return False
     return images.tiles(bpy.data.images[ids.MOSAIC])["display"] == repr(display)
 
 
 def test_the_newest_display_wins_and_no_earlier_run_is_painted(projected, scene, monkeypatch):
     projected()
-    monkeypatch.setitem(
-        updates.FUNCTIONS, "display", lambda *_: setattr(recoloring, "_is_requested", True)
-    )  # as in a window
+    # As in a window.
+    monkeypatch.setitem(updates.FUNCTIONS, "display", lambda *_: setattr(recoloring, "_is_requested", True))
     scene.mphdrr_display.colors = "GREY"
     steps = recoloring.recoloring()
     next(steps)  # numbers are being read

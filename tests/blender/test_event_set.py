@@ -16,13 +16,11 @@ from mphdrr.addon.scanner import scanner
 from mphdrr.addon.volumes import volumes
 from mphdrr.core import events
 from mphdrr.core.events.templates import TEMPLATES
-from mphdrr.core.progress import Cancelled
 from mphdrr.core.runs.files import read_run
 from mphdrr.core.workbook import read_system
 
-from .conftest import refused, reopened
+from .conftest import WORKBOOK, cancelled, refused, reopened
 
-WORKBOOK = Path(__file__).parents[2] / "examples" / "dc-spect-80.xlsx"
 TEXT = f"""
 version = 1
 seed = 3
@@ -174,13 +172,7 @@ def test_a_set_is_that_of_the_library_and_goes_on_after_cancel(recipe, scene, tm
     events.make(recipe, tmp_path / "expected", 2)
     folder = scene.mphdrr_events.folder
     job = event_sets.make_set_job(str(tmp_path / "small.toml"), folder, 2)
-
-    def progress(done: int, total: int) -> None:
-        if done == 1:
-            raise Cancelled
-
-    with pytest.raises(Cancelled):
-        jobs.run(job, progress)
+    cancelled(job, lambda done, total: done == 1)
     assert job.leftovers() == "1 event made now and kept; Make Event Set goes on from there"
     first = Path(folder, "events", "000000.h5")
     assert [path.name for path in first.parent.iterdir()] == [first.name]

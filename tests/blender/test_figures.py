@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from pathlib import Path
 
 import bpy
 import numpy as np
@@ -51,6 +52,13 @@ def example(scene, dc_spect, tmp_path):
     return scene
 
 
+def draw(kind: str, path: Path, size: tuple[int, int], **options) -> list[str]:
+    """Draw a figure into a file, and return what is warned of."""
+    with recorded_warnings() as texts:
+        jobs.run(figures.figure_job(bpy.context, kind, [path], size, **options))
+    return texts
+
+
 def picture(path) -> np.ndarray:
     return np.asarray(Image.open(path).convert("RGB")).astype(int)
 
@@ -67,22 +75,10 @@ def test_a_rendered_figure_leaves_the_scene_as_it_was(example, tmp_path):
 
 
 @pytest.mark.long
-def test_a_volume_is_shown_in_its_look(example, tmp_path):
-    (item,) = volumes.volume_objects(example)
-    for look in ("DENSITY", "SHELL"):  # smoke, and a surface that is an object of its own
-        item.mphdrr_volume.look = look
-        before, path = state(), tmp_path / f"{look}.png"
-        jobs.run(figures.figure_job(bpy.context, "inside", [path], (320, 240), labels=False, samples=1))
-        assert state() == before
-        shown = picture(path)
-        assert np.count_nonzero(shown[..., 0] - shown[..., 1] > 40) > 200, f"{look}: the phantom's purple"
-
-
-@pytest.mark.long
 def test_a_scanner_fits_its_figure_with_even_margins(example, tmp_path):
     for size in ((480, 240), (240, 420)):
         path = tmp_path / f"{size[0]}.png"
-        jobs.run(figures.figure_job(bpy.context, "scanner", [path], size, labels=False, samples=2))
+        draw("scanner", path, size, labels=False, samples=2)
         shown = picture(path)
         inside = np.argwhere((np.abs(shown - shown[2, 2]) > 24).any(axis=2))
         free = [*inside.min(axis=0), *(np.array(shown.shape[:2]) - 1 - inside.max(axis=0))]
@@ -134,12 +130,6 @@ def test_pixels_of_a_rendered_picture_are_read_exactly(scene, tmp_path):
     assert "page.png" not in bpy.data.images
 
 
-def warned(call) -> list[str]:
-    with recorded_warnings() as texts:
-        call()
-    return texts
-
-
 def test_a_picture_that_a_volume_does_not_change_is_warned_of(example, tmp_path, monkeypatch):
     """As where this Blender's Cycles draws no volumes: pictures with and without it are the same."""
     (item,) = volumes.volume_objects(example)
@@ -158,28 +148,31 @@ def test_a_picture_that_a_volume_does_not_change_is_warned_of(example, tmp_path,
     monkeypatch.setattr(figures, "_render_pixels", render)
     for kind in ("cut-away", "inside"):
         sizes.clear()
-        job = figures.figure_job(bpy.context, kind, [path], (640, 480), samples=1)
-        (text,) = warned(lambda job=job: jobs.run(job))
+        (text,) = draw(kind, path, (640, 480), samples=1)
         assert text.startswith(f"the picture shows {item.name!r} as the surface at 50 kBq/mL: ") and path.is_file()
         assert sizes[-1] == (640, True) and {width for width, _ in sizes[:-1]} == {243}
     changes = 60
-    assert warned(lambda: jobs.run(figures.figure_job(bpy.context, "inside", [path], (640, 480)))) == []
+    assert draw("inside", path, (640, 480)) == []
     sizes.clear()
-    assert warned(lambda: jobs.run(figures.figure_job(bpy.context, "scanner", [path], (640, 480)))) == []
+    assert draw("scanner", path, (640, 480)) == []
     assert len(sizes) == 1, "a figure without a volume is rendered once"
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("look", ["DENSITY", "SHELL"])
 def test_a_volume_is_seen_or_its_absence_is_said(example, tmp_path, look):
+    """As smoke, and as a surface that is an object of its own."""
     (item,) = volumes.volume_objects(example)
     item.mphdrr_volume.look, path = look, tmp_path / "a.png"
+    before = state()
     for kind in ("cut-away", "inside"):
-        job = figures.figure_job(bpy.context, kind, [path], (240, 150), samples=1)
-        assert warned(lambda job=job: jobs.run(job)) == []
+        assert draw(kind, path, (320, 240), labels=False, samples=1) == []
+    assert state() == before
+    shown = picture(path)
+    assert np.count_nonzero(shown[..., 0] - shown[..., 1] > 40) > 200, "the phantom's purple"
     item.mphdrr_volume.display_high = item.mphdrr_volume.surface = 1e7
     item.mphdrr_volume.display_low = 9e6
-    (text,) = warned(lambda: jobs.run(figures.figure_job(bpy.context, "inside", [path], (240, 150), samples=1)))
+    (text,) = draw("inside", path, (240, 150), samples=1)
     assert "Low and High draw none of its values" in text
 
 
@@ -208,9 +201,8 @@ def test_render_says_which_volumes_of_the_view_it_lacks(small_render, capfd, mon
     monkeypatch.setattr(figures, "draw_figure", lambda *_: iter(()))  # whose own tests are above
     assert rendered(small_render, capfd) == ""
     item.hide_render = True
-    assert (
-        rendered(small_render, capfd) == f"mphDRR: the picture shows nothing of {item.name!r}: it is hidden in renders"
-    )
+    nothing = f"mphDRR: the picture shows nothing of {item.name!r}: "
+    assert rendered(small_render, capfd) == f"{nothing}it is hidden in renders"
     item.hide_set(True)
     assert rendered(small_render, capfd) == "", "it is seen nowhere, as is meant"
     item.hide_set(False)
@@ -270,7 +262,7 @@ def pictured(scene, dc_spect):
 
 
 def share_of_phantom(shown: np.ndarray) -> float:
-    """Of pixels that are purple or pink, as activity is and nothing else."""
+    """Return the share of pixels that are purple or pink, as activity is and nothing else."""
     red, green, blue = np.moveaxis(shown, -1, 0)
     return float(np.mean((red - green > 40) & (blue - green > 20)))
 
@@ -280,19 +272,17 @@ def share_of_paper(shown: np.ndarray, style: str) -> float:
 
 
 def share_of_lit(shown: np.ndarray) -> float:
-    """Of pixels in the orange of rays and lit modules."""
+    """Return the share of pixels in the orange of rays and lit modules."""
     return float(np.mean(shown[..., 0] - shown[..., 2] > 60))
 
 
 def test_a_picture_shows_the_phantom_on_its_paper(pictured, tmp_path):
     """On light paper; animations are on dark."""
-    path, style = tmp_path / "picture.png", "light"
-    common = {"filepath": str(path), "style": style, "width": SIZE[0], "height": SIZE[1], "samples": 2}
-    bpy.ops.mphdrr.render_picture(**common, labels=False)
+    path, size = tmp_path / "picture.png", {"width": SIZE[0], "height": SIZE[1]}
+    bpy.ops.mphdrr.render_picture(filepath=str(path), style="light", samples=2, labels=False, **size)
     shown = picture(path)
-    assert share_of_phantom(shown) > 0.02 and share_of_paper(shown, style) > 0.1 and share_of_lit(shown) > 0.02
-    for other in set(PAPERS) - {style}:
-        assert share_of_paper(shown, other) < 0.02
+    assert share_of_phantom(shown) > 0.02 and share_of_lit(shown) > 0.02
+    assert share_of_paper(shown, "light") > 0.1 and share_of_paper(shown, "dark") < 0.02
 
 
 def test_an_animation_has_the_phantom_on_its_first_and_last_picture(pictured, tmp_path):
@@ -318,9 +308,8 @@ def test_an_animation_has_the_phantom_on_its_first_and_last_picture(pictured, tm
 
 
 def test_an_animation_that_is_ended_keeps_its_pictures(pictured, tmp_path, monkeypatch):
-    monkeypatch.setattr(
-        figures, "_render_pixels", lambda scene: (yield) or np.full((SIZE[1], SIZE[0], 3), 200, np.uint8)
-    )
+    grey = np.full((SIZE[1], SIZE[0], 3), 200, np.uint8)
+    monkeypatch.setattr(figures, "_render_pixels", lambda scene: (yield) or grey)
     monkeypatch.setattr(figures, "_are_visible", lambda *_: (yield) or True)
     path = tmp_path / "film.mp4"
     path.write_bytes(b"older")
@@ -354,9 +343,7 @@ def test_a_volume_that_cycles_does_not_draw_is_a_surface(pictured, tmp_path, mon
 
     monkeypatch.setattr(FigureScene, "_add_volume", put_far_away)
     path = tmp_path / "picture.png"
-    with recorded_warnings() as said:
-        jobs.run(figures.figure_job(bpy.context, "picture", [path], SIZE, labels=False, samples=2))
-    (text,) = said
+    (text,) = draw("picture", path, SIZE, labels=False, samples=2)
     assert text.startswith("the picture shows 'Derenzo' as the surface at 50 kBq/mL") and "no volumes" in text
     assert share_of_phantom(picture(path)) > 0.02
 

@@ -125,10 +125,8 @@ def test_files_can_be_shared_and_are_when_they_are_large(study, tmp_path, monkey
     monkeypatch.setattr(storage, "_is_too_large", lambda path, size, target: path.suffix == ".h5")
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "c.blend"))
     assert "Copied 5 files (" in (said := capfd.readouterr().out) and "shares 1 file (" in said
-    assert (
-        storage.absolute(bpy.context.scene.mphdrr_projections.run_file).resolve().parent
-        == study.parent / "study_mphdrr"
-    )
+    run_file = storage.absolute(bpy.context.scene.mphdrr_projections.run_file)
+    assert run_file.resolve().parent == study.parent / "study_mphdrr"
     bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "c.blend"))
     is_whole(tmp_path, expected)
 
@@ -163,10 +161,8 @@ def test_collect_files_brings_workbook_pictures_and_what_is_shared(study, tmp_pa
     bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "c" / "b.blend"))
     home, scene = tmp_path / "c" / "b_mphdrr", bpy.context.scene
     is_whole(home, expected)
-    collection = scanner.active_scanner(scene)
-    assert (
-        storage.absolute(collection.mphdrr_scanner.workbook) == scanner.source(collection).path == home / "small.xlsx"
-    )
+    collection, tables = scanner.active_scanner(scene), home / "small.xlsx"
+    assert storage.absolute(collection.mphdrr_scanner.workbook) == scanner.source(collection).path == tables
     assert bpy.data.scenes["Other"].mphdrr_projections.efficiency_of_modules == "1, 0.5"
     assert scene.mphdrr_events.folder == "//../a/not-made-yet-events"
     assert storage.absolute(scene.mphdrr_projections.efficiency_of_modules).name == "flood-2.npy"

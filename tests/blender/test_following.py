@@ -17,19 +17,23 @@ from mphdrr.core.errors import InputError
 from mphdrr.core.geometry.grid import Grid
 from mphdrr.core.volumes.volume import Volume
 
-from .conftest import part, reopened, select, update
+from .conftest import assert_same, move, part, reopened, select, update
 
 MOTION = Matrix.Translation((4.0, -9.0, 6.5)) @ Euler((0.1, -0.2, 0.3)).to_matrix().to_4x4()
 
 
 @pytest.fixture
-def collection(scene, ring_system):
-    made = scanner.build_scanner(scene, ring_system)
-    made.mphdrr_scanner.keep_aimed = False
+def box(scene) -> None:
+    """A small volume of activity in the middle of the scene."""
     volumes.add_volume(Volume(np.ones((2, 2, 2), np.float32), Grid.centered(2, 2.0), "activity"), "Box")
+
+
+@pytest.fixture
+def collection(ring, box):
+    ring.mphdrr_scanner.keep_aimed = False
     bpy.ops.mphdrr.render_projections(width=8, height=6)
     update()
-    return made
+    return ring
 
 
 @pytest.mark.parametrize("name", ["COLLIMATOR", "CRYSTAL", "PLANE"])
@@ -42,17 +46,14 @@ def test_the_module_goes_where_a_part_is_put(collection, name):
     for _ in range(3):  # what the handler writes is an update again
         update()
     assert np.allclose(camera.matrix_world, MOTION @ before, atol=1e-4)
-    assert np.allclose(item.matrix_parent_inverse @ item.matrix_basis, local, atol=1e-6), (
-        "it is where it was on its module"
-    )
+    assert np.allclose(item.matrix_parent_inverse @ item.matrix_basis, local, atol=1e-6), "it stays on its module"
     after = scanner.read_scanner(collection)
     motion = np.array(MOTION)[:3, :3]
     assert np.allclose(after.frames()[2], scanner_before.frames()[2] @ motion.T, atol=1e-6), "tilted as the part was"
     assert after.centers[2] == pytest.approx(list(MOTION @ before.translation), abs=1e-4)
     assert np.array_equal(np.delete(after.centers, 2, 0), np.delete(numbers, 2, 0))
     collection.mphdrr_scanner.keep_aimed = True
-    item.location.z += 2.0
-    update()
+    move(item, z=2.0)
     assert camera.mphdrr_module.aimed and scanner.unaimed_numbers(collection, [camera]) == []
 
 
@@ -120,27 +121,23 @@ def test_what_is_locked_animated_copied_or_moved_itself_is_respected(scene, coll
 
     camera.keyframe_insert("location", frame=1)
     place = camera.location.copy()
-    item.location.x += 5.0
-    update()
+    move(item, x=5.0)
     assert camera.location == place and np.array_equal(item.matrix_basis, np.eye(4))
 
     other = scanner.module(collection, 6)
     copy = part(other, "COLLIMATOR").copy()
     other.users_collection[0].objects.link(copy)
     place = objects.world_matrix(other)
-    copy.location.x += 20.0
-    update()
+    move(copy, x=20.0)
     assert np.array_equal(objects.world_matrix(other), place) and copy.location.x == 20.0
     assert planes.planes(scene)
 
 
 def test_parts_that_version_0_1_0_locked_are_freed_and_the_users_locks_stay(collection, tmp_path):
-    path = str(tmp_path / "old.blend")
     item = part(scanner.module(collection, 1), "CRYSTAL")
     for was_free in (False, True):
         item.lock_location, collection.mphdrr_scanner.parts_free = (True, True, True), was_free
-        reopened(path)
-        collection = scanner.active_scanner(bpy.context.scene)
+        collection = scanner.active_scanner(reopened(tmp_path / "old.blend"))
         item = part(scanner.module(collection, 1), "CRYSTAL")
         assert tuple(item.lock_location) == (was_free,) * 3
 
@@ -195,24 +192,20 @@ def test_each_edit_changes_the_selected_one(scene, a_and_b):
         bpy.ops.mphdrr.remove_modules()
         now = scanner.read_scanner(mine)
         assert 5 not in now.numbers and (now.detector_thickness == 7.5).all() and 3.5 in now.pinhole_diameter
-        after = scanner.read_scanner(other)
-        for name in ("centers", "numbers", "detector_thickness", "pinhole_diameter"):
-            assert np.array_equal(getattr(before, name), getattr(after, name)), name
+        assert_same(scanner.read_scanner(other), before)
         mine.mphdrr_scanner.detector_thickness = 9.5
         scanner.show_modules(mine, 0, 0, "ALL")
 
 
-def test_a_run_belongs_to_its_scanner(scene, a_and_b):
+def test_a_run_belongs_to_its_scanner(scene, a_and_b, box):
     a, b = a_and_b
-    volumes.add_volume(Volume(np.ones((2, 2, 2), np.float32), Grid.centered(2, 2.0), "activity"), "Box")
     select(scanner.module(a, 1))
     bpy.ops.mphdrr.render_projections(width=8, height=8)
     select(scanner.module(b, 6))
     mosaic = bpy.data.images[ids.MOSAIC]
     scene.mphdrr_display.colors = "GREY"  # made anew
-    assert images.scanner_of(mosaic) == a and {plane.parent for plane in planes.planes(scene)} == set(
-        scanner.modules(a)
-    )
+    assert images.scanner_of(mosaic) == a
+    assert {plane.parent for plane in planes.planes(scene)} == set(scanner.modules(a))
 
     found = images.tiles(mosaic)
     row, column = np.reshape(found["corners"], (-1, 2))[found["numbers"].index(6)]

@@ -7,27 +7,23 @@ import numpy as np
 import pytest
 
 import mphdrr.core as mph
-from mphdrr.addon.blender import ids, jobs, objects, storage
+from mphdrr.addon.blender import ids, objects, storage
 from mphdrr.addon.perspective import frustums
 from mphdrr.addon.scanner import module_edits, scanner
 from mphdrr.addon.volumes import slices, volumes
-from mphdrr.core.progress import Cancelled
 from mphdrr.core.runs.mosaic import as_seen
 
-from .conftest import refused, reopened, update
+from .conftest import cancelled, datablocks, move, refused, reopened, turn, update
 
 SHAPE = 18, 26  # rows, columns
 
 
 @pytest.fixture
-def shown(scene, ring_system):
-    """A scanner of eight modules with other pixels than square ones of a square image, and a turned phantom."""
-    scanner.build_scanner(scene, ring_system, "Ring")
-    settings = scene.mphdrr_projections
-    settings.height, settings.width = SHAPE
-    bpy.ops.mphdrr.add_derenzo(voxels=32, rod_diameters=(10, 8, 0, 0, 0, 0), location=(5, -3, 2), phi=0.2)
+def shown(scene, derenzo):
+    """A turned phantom in a scanner of eight modules, with other pixels than square ones of a square image."""
+    scene.mphdrr_projections.height, scene.mphdrr_projections.width = SHAPE
     choose(3)
-    return bpy.context.object
+    return derenzo
 
 
 def choose(number: int) -> bpy.types.Object:
@@ -69,25 +65,23 @@ def expected_corners(g: mph.PerspectiveGrid, plane: int) -> np.ndarray:
     ])  # fmt: skip
 
 
-def names() -> tuple:
-    kinds = (
-        bpy.data.objects,
-        bpy.data.meshes,
-        bpy.data.images,
-        bpy.data.collections,
-        bpy.data.volumes,
-        bpy.data.materials,
-    )
-    return tuple(sorted(block.name for block in kind) for kind in kinds)
+def names() -> dict[str, list[str]]:
+    return datablocks("objects", "meshes", "images", "collections", "volumes", "materials")
+
+
+def show(planes: int, **settings: str) -> bpy.types.Object:
+    """Show the active volume in the chosen module's perspective, and return the only frustum."""
+    assert bpy.ops.mphdrr.show_in_perspective(planes=planes, **settings) == {"FINISHED"}
+    (frustum,) = frustums.frustums(bpy.context.scene)
+    update()
+    return frustum
 
 
 @pytest.mark.parametrize(("uniform", "detector"), [("K", "VIRTUAL"), ("DEPTH", "REAL")])
 def test_layers_stand_on_the_rays_of_their_pixels_and_show_their_means(shown, scene, ring_system, uniform, detector):
     scene.mphdrr_projections.detector = detector
-    assert bpy.ops.mphdrr.show_in_perspective(planes=5, uniform=uniform) == {"FINISHED"}
-    (frustum,) = frustums.frustums(scene)
+    frustum = show(5, uniform=uniform)
     assert frustum.name == "Perspective 03" and frustum.parent.name == "Module 03" and bpy.context.object == shown
-    update()
     g = grid_of(shown, ring_system, 2, 5, uniform.lower())  # the real detector's pixels are on the same rays, but
     turned = slice(None, None, -1 if detector == "REAL" else 1)  # the other way round
     means = mph.to_perspective(volumes.volume_from_object(shown), g)
@@ -124,7 +118,9 @@ def test_what_is_low_is_transparent_and_colours_are_those_of_slices():
 def test_ct_numbers_are_air_outside_their_grid(ring_system):
     grid = mph.Grid.centered((9, 8, 7), 6.0)
     values = np.random.default_rng(3).uniform(-1000, 800, grid.shape).astype(np.float32)
-    g = grid_of_volume(grid, ring_system)
+    views = ring_system[4:5].views((12, 10))
+    (near,), (far,) = mph.depth_ranges(views, grid)
+    g = mph.PerspectiveGrid(views, 0, 8, near, far)
     found = frustums.to_module_cells(mph.Volume(values, grid, "hu"), g)
     np.testing.assert_allclose(found, mph.to_perspective(values + 1000, g, grid=grid) - 1000, atol=1e-3)
     back = frustums.to_voxels(found, g, mph.Volume(values, grid, "hu"))
@@ -133,26 +129,19 @@ def test_ct_numbers_are_air_outside_their_grid(ring_system):
     assert np.all(air == -1000) and np.all(frustums.to_voxels(air, g, mph.Volume(values, grid, "hu")).array == -1000)
 
 
-def grid_of_volume(grid: mph.Grid, system) -> mph.PerspectiveGrid:
-    views = system[4:5].views((12, 10))
-    near, far = mph.depth_ranges(views, grid)
-    return mph.PerspectiveGrid(views, 0, 8, near[0], far[0])
-
-
 def test_it_goes_with_its_module_and_says_what_is_not_true_any_more(shown, scene):
-    bpy.ops.mphdrr.show_in_perspective(planes=3)
-    (frustum,) = frustums.frustums(scene)
+    frustum = show(3)
     assert frustums.changes(scene, frustum) == ""
     camera = frustum.parent
-    update()
-    before = [np.linalg.inv(np.array(camera.matrix_world)) @ np.array(o.matrix_world) for o in frustums.layers(frustum)]
-    camera.location.z += 20.0
-    update()
-    after = [np.linalg.inv(np.array(camera.matrix_world)) @ np.array(o.matrix_world) for o in frustums.layers(frustum)]
-    np.testing.assert_allclose(after, before, atol=1e-3)
+
+    def places() -> list[np.ndarray]:
+        return [np.array(camera.matrix_world.inverted() @ layer.matrix_world) for layer in frustums.layers(frustum)]
+
+    before = places()
+    move(camera, z=20.0)
+    np.testing.assert_allclose(places(), before, atol=1e-3)
     assert frustums.changes(scene, frustum) == "Module 03 has moved, or has other pixels"
-    camera.location.z -= 20.0
-    update()
+    move(camera, z=-20.0)
     assert frustums.changes(scene, frustum) == ""
     scene.mphdrr_projections.width = 30
     assert "other pixels" in frustums.changes(scene, frustum)
@@ -161,11 +150,9 @@ def test_it_goes_with_its_module_and_says_what_is_not_true_any_more(shown, scene
     shown.mphdrr_volume.display_high *= 0.5
     assert frustums.visible_volumes(scene) == []
     assert frustums.changes(scene, frustum) == "other colours of Derenzo"
-    shown.location.x += 4.0
-    update()
+    move(shown, x=4.0)
     assert frustums.changes(scene, frustum) == "other place and colours of Derenzo"
-    bpy.ops.mphdrr.show_in_perspective(planes=3)
-    (frustum,) = frustums.frustums(scene)
+    frustum = show(3)
     assert frustums.changes(scene, frustum) == ""
     bpy.data.objects.remove(shown)
     assert frustums.changes(scene, frustum) == "Derenzo is gone"
@@ -173,13 +160,9 @@ def test_it_goes_with_its_module_and_says_what_is_not_true_any_more(shown, scene
 
 def test_a_module_that_is_turned_away_has_its_frustum_where_its_views_are(shown, scene, ring_system):
     camera = choose(3)
-    camera.rotation_euler.y += 0.05
-    camera.rotation_euler.z -= 0.04
-    update()
-    bpy.ops.mphdrr.show_in_perspective(planes=2)
-    (frustum,) = frustums.frustums(scene)
+    turn(camera, y=0.05, z=-0.04)
+    frustum = show(2)
     assert frustum.parent == camera
-    update()
     tilted = scanner.read_scanner(scanner.active_scanner(scene))
     assert np.linalg.norm(tilted.tilt[2]) > 0.03
     g = grid_of(shown, tilted, 2, 2, "k")
@@ -188,11 +171,8 @@ def test_a_module_that_is_turned_away_has_its_frustum_where_its_views_are(shown,
 
 def test_again_replaces_and_clear_leaves_nothing(shown, scene):
     before = names()
-    bpy.ops.mphdrr.show_in_perspective(planes=12)
-    assert [layer.name for layer in frustums.layers(frustums.frustums(scene)[0])][:2] == [
-        "Perspective 03 layer 01",
-        "Perspective 03 layer 02",
-    ]
+    layers = frustums.layers(show(12))
+    assert [layer.name for layer in layers][:2] == ["Perspective 03 layer 01", "Perspective 03 layer 02"]
     bpy.ops.mphdrr.show_in_perspective(planes=4)
     choose(5)
     bpy.ops.mphdrr.show_in_perspective(planes=2)
@@ -205,8 +185,7 @@ def test_again_replaces_and_clear_leaves_nothing(shown, scene):
 
 def test_it_is_hidden_and_removed_with_its_module(shown, scene):
     before = names()
-    bpy.ops.mphdrr.show_in_perspective(planes=2)
-    (frustum,) = frustums.frustums(scene)
+    frustum = show(2)
     scanner.set_visible(frustum.parent, False)
     update()
     assert frustum.hide_viewport and all(layer.hide_viewport for layer in frustum.children)
@@ -215,16 +194,16 @@ def test_it_is_hidden_and_removed_with_its_module(shown, scene):
     assert not frustum.hide_viewport and not any(layer.hide_viewport for layer in frustum.children)
     camera = frustum.parent
     module_edits.remove_modules(scanner.active_scanner(scene), [camera])
-    assert frustums.frustums(scene) == [] and names()[2] == before[2]
+    assert frustums.frustums(scene) == [] and names()["images"] == before["images"]
     choose(4)
     bpy.ops.mphdrr.show_in_perspective(planes=2)
     module_edits.remove_scanner(scene, scanner.active_scanner(scene))
-    assert frustums.frustums(scene) == [] and names()[2:4] == (before[2], [n for n in before[3] if "Ring" not in n])
+    assert frustums.frustums(scene) == [] and names()["images"] == before["images"]
+    assert names()["collections"] == [name for name in before["collections"] if "Ring" not in name]
 
 
 def test_it_is_hidden_where_its_modules_camera_was_deleted(shown, scene):
-    bpy.ops.mphdrr.show_in_perspective(planes=2)
-    (frustum,) = frustums.frustums(scene)
+    frustum = show(2)
     bpy.data.objects.remove(frustum.parent)
     update()
     assert frustums.changes(scene, frustum) == "its module is gone"
@@ -245,9 +224,7 @@ def test_what_cannot_be_shown_is_refused_in_a_line(shown, scene):
 def test_a_volume_around_the_pinhole_begins_a_little_before_it(shown, scene):
     shown.scale = (6.0, 6.0, 6.0)
     update()
-    bpy.ops.mphdrr.show_in_perspective(planes=4, uniform="DEPTH")
-    (frustum,) = frustums.frustums(scene)
-    update()
+    frustum = show(4, uniform="DEPTH")
     source = np.array(frustum.parent.matrix_world)[:3, 3]
     depths = [-np.array(layer.matrix_basis)[2, 3] for layer in frustums.layers(frustum)]
     assert depths[0] > 0.1 * np.linalg.norm(source) and np.all(np.diff(depths) > 0)
@@ -256,22 +233,15 @@ def test_a_volume_around_the_pinhole_begins_a_little_before_it(shown, scene):
 def test_cancelled_it_leaves_everything_as_it_was(shown, scene):
     bpy.ops.mphdrr.show_in_perspective(planes=3)
     before, files = names(), sorted(storage.folder().iterdir())
-
-    def progress(done: int, total: int) -> None:
-        if total > 1:
-            raise Cancelled
-
     for job in (frustums.frustum_job(bpy.context, 4, "K"), frustums.resample_job(bpy.context, 8, "K")):
-        with pytest.raises(Cancelled):
-            jobs.run(job, progress)
+        cancelled(job, lambda done, total: total > 1)
     assert names() == before and sorted(storage.folder().iterdir()) == files
 
 
 def test_undo_takes_it_back_and_redo_shows_it_again(shown, scene):
     bpy.ops.ed.undo_push(message="Before")
-    bpy.ops.mphdrr.show_in_perspective(planes=2)
+    pixels = list(frustums.layers(show(2))[0].data.pixels)
     bpy.ops.ed.undo_push(message="Perspective")
-    pixels = list(frustums.layers(frustums.frustums(scene)[0])[0].data.pixels)
     bpy.ops.ed.undo()
     assert frustums.frustums(bpy.context.scene) == [] and ids.PERSPECTIVES not in bpy.data.collections
     bpy.ops.ed.redo()
@@ -281,8 +251,7 @@ def test_undo_takes_it_back_and_redo_shows_it_again(shown, scene):
 
 
 def test_a_saved_file_opens_with_it(shown, scene, tmp_path):
-    bpy.ops.mphdrr.show_in_perspective(planes=2)
-    pixels = list(frustums.layers(frustums.frustums(scene)[0])[1].data.pixels)
+    pixels = list(frustums.layers(show(2))[1].data.pixels)
     reopened(tmp_path / "a.blend")
     (frustum,) = frustums.frustums(bpy.context.scene)
     assert list(frustums.layers(frustum)[1].data.pixels) == pixels and max(pixels) > 0
@@ -302,5 +271,4 @@ def test_back_on_voxels_it_is_what_the_modules_cells_keep(shown, scene, ring_sys
     np.testing.assert_allclose(found.grid.affine, volume.grid.affine, atol=1e-5)
     np.testing.assert_allclose(found.array, expected, atol=1e-5 * expected.max())
     np.testing.assert_allclose(objects.world_matrix(item), objects.world_matrix(shown), atol=1e-6)
-    bpy.ops.mphdrr.show_in_perspective(planes=2)
-    assert frustums.volume_name(frustums.frustums(scene)[0]) == item.name
+    assert frustums.volume_name(show(2)) == item.name

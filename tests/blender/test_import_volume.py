@@ -12,7 +12,6 @@ import pytest
 from mphdrr.addon.blender import storage
 from mphdrr.addon.phantoms import phantoms
 from mphdrr.addon.phantoms.phantom_properties import plain_settings
-from mphdrr.addon.scanner import scanner
 from mphdrr.addon.volumes import slices, stored_volumes, volume_materials, volumes
 from mphdrr.addon.volumes.stored_volumes import store_volume
 from mphdrr.addon.volumes.vdb import openvdb, write_vdb
@@ -26,7 +25,7 @@ from mphdrr.core.runs.files import read_run
 from mphdrr.core.volumes.volume import Volume
 from mphdrr.core.volumes.volume_files import write_volume
 
-from .conftest import refused, reopened, update
+from .conftest import datablocks, refused, reopened, slice_pixels, update, volume_picture
 
 AFFINE = euler_pose(0.3, 0.1, -0.2, (40.0, 50.0, 60.0)) @ np.diag([0.7, -0.8, 2.5, 1.0])
 
@@ -73,11 +72,9 @@ def test_bad_files_are_refused_in_one_line_and_add_nothing(tmp_path, name, setti
     for text in ("text.nii", "text.vdb", "picture.png"):
         (tmp_path / text).write_text("hello")
     write_volume(Volume(np.ones((2, 2, 2)), Grid.centered(2, 1.0), "mu"), tmp_path / "mu.npz")
-    before = len(bpy.data.objects), len(bpy.data.volumes)
-    with pytest.raises(RuntimeError, match=message) as refusal:
-        bpy.ops.mphdrr.import_volume(filepath=str(tmp_path / name), **settings)
-    assert len(str(refusal.value).strip().splitlines()) == 1
-    assert (len(bpy.data.objects), len(bpy.data.volumes)) == before
+    before = datablocks("objects", "volumes")
+    refused(bpy.ops.mphdrr.import_volume, message, filepath=str(tmp_path / name), **settings)
+    assert datablocks("objects", "volumes") == before
 
 
 def test_ct_begins_with_a_window_of_its_own_and_keeps_the_users(ct):
@@ -114,13 +111,6 @@ def _replace(item, volume: Volume) -> None:
     volumes.replace_stored(item, stored_volumes.store_volume(volume, storage.folder()))
 
 
-def _pixels(plane):
-    image = plane.data.materials[0].node_tree.nodes["Slice"].image
-    pixels = np.empty(4 * image.size[0] * image.size[1], np.float32)
-    image.pixels.foreach_get(pixels)
-    return pixels.reshape(image.size[1], image.size[0], 4)
-
-
 def test_slices_show_the_voxels_where_they_are(ct):
     item = volumes.add_volume(ct, "CT", euler_pose(0.5, 0.1, 0.2, (1.0, 2.0, 3.0)))
     planes = slices.add_slices(item)
@@ -132,25 +122,27 @@ def test_slices_show_the_voxels_where_they_are(ct):
     for axis, plane in enumerate(planes):
         values = np.take(ct.array, index[axis], axis).T
         expected = shades[((values + 1000.0) * (255 / 2500.0)).astype(int)]
-        np.testing.assert_allclose(_pixels(plane), expected, atol=1 / 255)
+        np.testing.assert_allclose(slice_pixels(plane), expected, atol=1 / 255)
         corner = np.array(index, float)
         corner[[a for a in range(3) if a != axis]] = -0.5
         world = plane.matrix_world @ plane.data.vertices[0].co
         np.testing.assert_allclose(world, (AFFINE @ [*corner, 1.0])[:3], atol=1e-4)
     assert [plane.name for plane in planes] == ["CT Sagittal", "CT Coronal", "CT Axial"]
     item.mphdrr_volume.slices = (1000, 0, 0)  # beyond the edge: the last
-    np.testing.assert_allclose(_pixels(planes[0])[0, 0], shades[int((ct.array[12, 0, 0] + 1000) * 0.102)], atol=0.01)
+    last = shades[int((ct.array[12, 0, 0] + 1000) * 0.102)]
+    np.testing.assert_allclose(slice_pixels(planes[0])[0, 0], last, atol=0.01)
 
 
 def test_slices_follow_new_voxels_and_go(ct):
     item = volumes.add_volume(ct, "CT")
-    before = len(bpy.data.objects), len(bpy.data.images), len(bpy.data.meshes), len(bpy.data.materials)
+    kinds = "objects", "images", "meshes", "materials"
+    before = datablocks(*kinds)
     slices.add_slices(item)
     _replace(item, Volume(ct.array[:5].copy(), Grid((5, 11, 7), AFFINE), "hu"))
     coronal = slices.planes_of(item)[1]
-    assert _pixels(coronal).shape[:2] == (7, 5)
+    assert slice_pixels(coronal).shape[:2] == (7, 5)
     slices.remove_slices(item)
-    assert (len(bpy.data.objects), len(bpy.data.images), len(bpy.data.meshes), len(bpy.data.materials)) == before
+    assert datablocks(*kinds) == before
 
 
 @pytest.mark.long
@@ -247,10 +239,10 @@ def test_sequence_is_saved_and_cleaned_up_whole(tmp_path, beats, monkeypatch, la
 def test_slices_beat_along(beats):
     item = volumes.add_volume(beats, "Heart")
     plane = slices.add_slices(item)[2]
-    first = _pixels(plane)
+    first = slice_pixels(plane)
     bpy.context.scene.frame_set(3)
     assert slices.planes_of(item)[2] == plane
-    np.testing.assert_array_equal(_pixels(plane), np.roll(first, 2, axis=1))
+    np.testing.assert_array_equal(slice_pixels(plane), np.roll(first, 2, axis=1))
 
 
 def test_sequence_of_what_cannot_follow_is_refused(ct):
@@ -293,8 +285,7 @@ def test_a_volume_begins_to_beat_and_stands_still_again(two_states):
     assert not item.data.is_sequence and volumes.file_of(item) == still, "files are named by content"
 
 
-def test_the_current_frame_is_projected(scene, ring_system, two_states):
-    scanner.build_scanner(scene, ring_system)
+def test_the_current_frame_is_projected(scene, ring, ring_system, two_states):
     volumes.add_volume(two_states, "Heart")
     views = ring_system.views(shape=(12, 10))
     for frame, expected in enumerate(two_states, 1):
@@ -338,24 +329,11 @@ def test_files_follow_each_other_as_shown(tmp_path, halves, scene):
 
 
 def _brightness(scene) -> tuple[float, float]:
-    """Brightness of the left and right half of Cycles' picture from the front, with the first file's cube in the middle."""
-    for other in [o for o in scene.objects if o.type != "VOLUME"]:
-        bpy.data.objects.remove(other)
-    camera = bpy.data.objects.new("Camera", bpy.data.cameras.new("Camera"))
-    scene.collection.objects.link(camera)
-    camera.location, camera.rotation_euler = (0, -100, 0), (np.pi / 2, 0, 0)
-    camera.data.type, camera.data.ortho_scale = "ORTHO", 40.0
-    scene.camera, scene.world, scene.render.engine, scene.cycles.samples = camera, None, "CYCLES", 4
+    """Return the brightness of both halves of Cycles' picture from the front, the first file's cube in its middle."""
     if hasattr(scene.cycles, "volume_biased"):
         scene.cycles.volume_biased = True  # 5.2's other method takes a hundred times as long
-    scene.render.resolution_x = scene.render.resolution_y = 16
-    scene.render.resolution_percentage = 100
-    scene.render.filepath = str(Path(bpy.app.tempdir) / "frame.png")
-    bpy.ops.render.render(write_still=True)
-    image = bpy.data.images.load(scene.render.filepath)
-    picture = np.array(image.pixels).reshape(16, 16, 4)[..., :3].sum(axis=(0, 2))
-    bpy.data.images.remove(image)
-    return float(picture[:8].sum()), float(picture[8:].sum())
+    columns = volume_picture(scene, (0, 2), np.zeros(3), 40.0, 16, samples=4)[..., :3].sum(axis=(0, 2))
+    return float(columns[:8].sum()), float(columns[8:].sum())
 
 
 def test_files_that_are_no_sequence_are_refused(tmp_path, halves):

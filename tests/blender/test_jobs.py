@@ -1,6 +1,7 @@
 """Jobs: what they say, the queue, and that cancelling them in any stage leaves everything as it was."""
 
 import time
+from pathlib import Path
 from types import SimpleNamespace
 
 import bpy
@@ -25,12 +26,8 @@ from .conftest import refused, reopened
 
 
 @pytest.fixture
-def scanned(scene, ring_system):
+def scanned(derenzo):
     """A scanner, a phantom that is active, and a run of its projections."""
-    scanner.build_scanner(scene, ring_system, "Ring")
-    jobs.run(
-        phantoms.add_phantom_job(plain_settings("derenzo", voxels=16, rod_diameters=(10, 8, 0, 0, 0, 0)), "Derenzo")
-    )
     bpy.ops.mphdrr.render_projections(width=10, height=12)
 
 
@@ -71,54 +68,37 @@ def everything() -> dict[str, object]:
     return found
 
 
-TANK = {"rod_diameters": (0,) * 6, "sphere_diameters": (30, 0, 0, 0, 0, 0)}  # little to paint
-
-
-def projecting(tmp_path):
+def projecting() -> jobs.Job:
     return rendering.render_job(bpy.context, Recipe({"detector.rows": 9, "detector.columns": 14}), "Derenzo")
 
 
-def adding(tmp_path):
-    return phantoms.add_phantom_job(plain_settings("jaszczak", voxels=16, **TANK), "Body", attenuation=True)
+def importing(path: Path) -> jobs.Job:
+    write_volume(Volume(np.ones((3, 4, 5)), Grid.centered((3, 4, 5), 2.0), "hu"), path / "ct.nii")
+    return volume_import.import_job([path / "ct.nii"])
 
 
-def updating(tmp_path):
-    return phantoms.update_phantom_job(bpy.data.objects["Derenzo"])
-
-
-def importing(tmp_path):
-    write_volume(Volume(np.ones((3, 4, 5)), Grid.centered((3, 4, 5), 2.0), "hu"), tmp_path / "ct.nii")
-    return volume_import.import_job([tmp_path / "ct.nii"])
-
-
-def mapping(tmp_path):
-    return maps.map_job(bpy.context.scene, "modules", 8)
-
-
-def exporting(tmp_path):
-    return scanner_files.export_workbook_job(scanner.active_scanner(bpy.context.scene), tmp_path / "own.xlsx")
-
-
-def loading(tmp_path):
-    return example.example_job(bpy.context)
-
-
-STAGES = {
-    projecting: ["Projecting", "reading", "projecting", "writing the run file", "packing", "storing"],
-    adding: ["Making a phantom", "voxelizing", "writing the voxels"],
-    updating: ["Making a phantom", "voxelizing", "writing the voxels"],
-    importing: ["Importing a volume", "writing the voxels"],
-    mapping: ["Modules map of 8 modules"],
-    exporting: ["Exporting the workbook", "writing the workbook"],
-    loading: ["Loading the example", "voxelizing", "writing the voxels", "projecting", "writing the run file", "packing",
-              "storing"],
+# Little to paint.
+TANK = plain_settings("jaszczak", voxels=16, rod_diameters=(0,) * 6, sphere_diameters=(30, 0, 0, 0, 0, 0))
+VOXELS, RUN = ["voxelizing", "writing the voxels"], ["projecting", "writing the run file", "packing", "storing"]
+JOBS = {  # functions of a folder that make jobs, and the stages of each
+    "projection": (lambda path: projecting(), ["Projecting", "reading", *RUN]),
+    "phantom": (
+        lambda path: phantoms.add_phantom_job(TANK, "Body", attenuation=True), ["Making a phantom", *VOXELS],
+    ),
+    "update": (lambda path: phantoms.update_phantom_job(bpy.data.objects["Derenzo"]), ["Making a phantom", *VOXELS]),
+    "import": (importing, ["Importing a volume", "writing the voxels"]),
+    "map": (lambda path: maps.map_job(bpy.context.scene, "modules", 8), ["Modules map of 8 modules"]),
+    "export": (
+        lambda path: scanner_files.export_workbook_job(scanner.active_scanner(bpy.context.scene), path / "own.xlsx"),
+        ["Exporting the workbook", "writing the workbook"],
+    ),
+    "example": (lambda path: example.example_job(bpy.context), ["Loading the example", *VOXELS, *RUN]),
 }  # fmt: skip
 
 
-@pytest.mark.parametrize(
-    "make", [pytest.param(make, marks=pytest.mark.long) if make is loading else make for make in STAGES]
-)
-def test_cancelling_in_any_stage_leaves_everything_as_it_was(scanned, tmp_path, monkeypatch, make):
+@pytest.mark.parametrize("name", [pytest.param(n, marks=pytest.mark.long) if n == "example" else n for n in JOBS])
+def test_cancelling_in_any_stage_leaves_everything_as_it_was(scanned, tmp_path, monkeypatch, name):
+    make, all_stages = JOBS[name]
     monkeypatch.setattr(example, "_VOXELS", 8)
     monkeypatch.setattr(example, "_PIXELS", 8)
     before, reached = everything(), []
@@ -136,26 +116,26 @@ def test_cancelling_in_any_stage_leaves_everything_as_it_was(scanned, tmp_path, 
 
         return begin
 
-    for stage in [words for words in STAGES[make] if words != "storing"]:
+    for stage in [words for words in all_stages if words != "storing"]:
         with pytest.raises(Cancelled):
-            jobs.run(make(tmp_path), StagedProgress(stages(stage), STAGES[make][0]))
+            jobs.run(make(tmp_path), StagedProgress(stages(stage), all_stages[0]))
         assert everything() == before, stage
-    if "storing" in STAGES[make]:
+    if "storing" in all_stages:
         for step in range(3):
             job = make(tmp_path)
             steps = job.finish(job.work(StagedProgress(stages(None), job.label)))
-            assert [next(steps) for _ in range(1 + step)][-1] == ("storing", step, 8 if make is projecting else 80)
+            assert [next(steps) for _ in range(1 + step)][-1] == ("storing", step, 8 if name == "projection" else 80)
             with pytest.raises(Cancelled):
                 steps.throw(Cancelled())
             job.discard()
             reached.append("storing")
             assert everything() == before, f"storing {step}"
-    assert set(reached) == set(STAGES[make])
+    assert set(reached) == set(all_stages)
 
 
-def test_only_what_is_left_unchanged_can_be_stopped(scanned, tmp_path):
+def test_only_what_is_left_unchanged_can_be_stopped(scanned):
     """The last step that can be cancelled is before the first change."""
-    job, before = projecting(tmp_path), everything()
+    job, before = projecting(), everything()
     steps = job.finish(job.work(lambda done, total: None))
     stoppable = []
     for step in steps:
@@ -280,8 +260,8 @@ def test_exact_numbers_take_no_memory_until_they_are_looked_at(scanned):
     assert volumes.volume_objects(bpy.context.scene)
 
 
-def test_a_run_is_shown_whatever_is_renamed_or_edited_meanwhile(scanned, scene, tmp_path):
-    job = projecting(tmp_path)
+def test_a_run_is_shown_whatever_is_renamed_or_edited_meanwhile(scanned, scene):
+    job = projecting()
     result = job.work(lambda done, total: None)
     scene.name, scanner.active_scanner(scene).name = "Another", "Other Ring"
     settings = scene.mphdrr_display

@@ -21,7 +21,7 @@ from mphdrr.core.physics.materials import attenuation
 from mphdrr.core.physics.performance import sensitivity
 from mphdrr.core.volumes.volume import Volume
 
-from .conftest import refused, reopened, update
+from .conftest import datablocks, refused, reopened, slice_pixels, update
 
 
 @pytest.fixture
@@ -54,7 +54,7 @@ def test_a_shell_shows_the_six_spheres_where_they_are(nema):
 
 
 def test_what_lies_in_front_of_the_slices_is_cut_away_and_comes_back(nema):
-    before = [len(kind) for kind in (bpy.data.objects, bpy.data.materials, bpy.data.node_groups, bpy.data.images)]
+    before = datablocks("objects", "materials", "node_groups", "images")
     settings = nema.mphdrr_volume
     settings.look = "CUT"
     assert len(slices.planes_of(nema)) == 3
@@ -75,16 +75,15 @@ def test_what_lies_in_front_of_the_slices_is_cut_away_and_comes_back(nema):
     vertices, _ = surface(nema)
     assert ((vertices - at[:3]) * [1, -1, 1] > 5.0).all(axis=1).any()
     settings.look = "DENSITY"
-    after = [len(kind) for kind in (bpy.data.objects, bpy.data.materials, bpy.data.node_groups, bpy.data.images)]
-    assert after == before
+    assert datablocks("objects", "materials", "node_groups", "images") == before
 
 
 def test_a_look_from_the_asset_library_restyles_a_volume_and_its_slices(nema, tmp_path):
     plane = slices.add_slices(nema)[2]
     nema.mphdrr_volume.display_high = 3.0
-    before = [len(bpy.data.materials), len(bpy.data.node_groups)]
+    before = datablocks("materials", "node_groups")
     assert bpy.ops.mphdrr.add_looks(directory=str(tmp_path)) == {"FINISHED"}
-    assert [len(bpy.data.materials), len(bpy.data.node_groups)] == before
+    assert datablocks("materials", "node_groups") == before
     assert bpy.context.preferences.filepaths.asset_libraries["mphDRR"].path == str(tmp_path)
     with bpy.data.libraries.load(str(tmp_path / "mphdrr-looks.blend"), assets_only=True) as (there, wanted):
         assert len(there.materials) == 6
@@ -94,8 +93,8 @@ def test_a_look_from_the_asset_library_restyles_a_volume_and_its_slices(nema, tm
 
     def brightest() -> np.ndarray:
         update()
-        pixels = np.array(plane.data.materials[0].node_tree.nodes["Slice"].image.pixels).reshape(-1, 4)
-        return pixels[pixels[:, :3].sum(axis=1).argmax(), :3]
+        colors = slice_pixels(plane)[..., :3].reshape(-1, 3)
+        return colors[colors.sum(axis=1).argmax()]
 
     assert np.allclose(brightest(), slices.color_table("", volume_materials.item_ramp(nema))[-1, :3], atol=0.01)
     assert look.inputs["High"].default_value == 3.0 and brightest()[2] < brightest()[0]
@@ -155,9 +154,7 @@ def test_slices_of_nema_show_six_spheres_also_after_reopening(nema, tmp_path):
     at = np.linalg.inv(slices._read_volume(nema).grid.affine) @ [0, 0, 0, 1]  # the spheres' middles
     nema.mphdrr_volume.slices = np.rint(at[:3]).astype(int).tolist()
     reopened(tmp_path / "a.blend")
-    image = slices.planes_of(bpy.data.objects["NEMA Body"])[2].data.materials[0].node_tree.nodes["Slice"].image
-    pixels = np.array(image.pixels).reshape(image.size[1], image.size[0], 4)
-    assert ndimage.label(pixels[..., 3] > 0)[1] == 6
+    assert ndimage.label(slice_pixels(slices.planes_of(bpy.data.objects["NEMA Body"])[2])[..., 3] > 0)[1] == 6
 
 
 def test_a_plane_that_the_user_deleted_leaves_the_others_as_they_are(nema):
@@ -169,8 +166,7 @@ def test_a_plane_that_the_user_deleted_leaves_the_others_as_they_are(nema):
     assert second.location.length > 0 and slices.plane_names(nema)[0] == ""
 
 
-def test_a_map_has_a_bar_in_the_unit_of_the_panels(scene, small_workbook):
-    bpy.ops.mphdrr.import_geometry(filepath=str(small_workbook))
+def test_a_map_has_a_bar_in_the_unit_of_the_panels(scene, imported):
     bpy.ops.mphdrr.add_map(quantity="sensitivity", voxels=9)
     item = bpy.data.objects["Sensitivity map"]
     middle = 1e6 * volumes.volume_from_object(item).array[4, 4, 4]
@@ -178,9 +174,8 @@ def test_a_map_has_a_bar_in_the_unit_of_the_panels(scene, small_workbook):
     title, texts = color_bar.labels(item)
     settings = item.mphdrr_volume
     assert title == "sensitivity, cps/MBq" and float(texts[0]) <= middle <= float(texts[-1])
-    assert (
-        float(texts[-1]) == pytest.approx(settings.maximum, rel=1e-3) == pytest.approx(settings.display_high, rel=1e-3)
-    )
+    assert float(texts[-1]) == pytest.approx(settings.maximum, rel=1e-3)
+    assert settings.maximum == pytest.approx(settings.display_high, rel=1e-3)
     assert len(slices.planes_of(item)) == 3
 
 
@@ -227,8 +222,8 @@ def test_map_is_the_cores_within_the_roi(imported):
     volume = volumes.volume_from_object(the_map())
     system = scanner.read_scanner(imported)
     expected = sensitivity_map(system, volume.grid).array
-    corners = np.stack(np.meshgrid(*map(np.arange, volume.grid.shape), indexing="ij"), axis=-1)
-    places = corners @ volume.grid.affine[:3, :3].T + volume.grid.affine[:3, 3]
+    affine = volume.grid.affine
+    places = np.moveaxis(np.indices(volume.grid.shape), 0, -1) @ affine[:3, :3].T + affine[:3, 3]
     inside = np.linalg.norm(places, axis=-1) <= system.roi_radius.max()
     assert np.array_equal(volume.array, np.where(inside, expected, 0))
     assert the_map().mphdrr_volume.unit == "cps/MBq"

@@ -10,14 +10,7 @@ import pytest
 
 from mphdrr.addon.volumes import volumes
 
-from .conftest import refused, update
-
-
-def select(*items):
-    for item in bpy.context.scene.objects:
-        item.select_set(item in items)
-    bpy.context.view_layer.objects.active = items[0]
-    update()
+from .conftest import centroid, refused, select
 
 
 def added():
@@ -46,10 +39,7 @@ def test_sphere_holds_its_activity():
     volume = added()
     assert volume.quantity == "activity"
     assert content(volume) == pytest.approx(7.0 * 4 / 3 * math.pi * 20**3, rel=5e-3)
-    weights = volume.array / volume.array.sum(dtype=np.float64)
-    index = np.stack(np.indices(volume.grid.shape), axis=-1)
-    middle = (weights[..., None] * index).sum(axis=(0, 1, 2)) @ volume.grid.affine[:3, :3].T + volume.grid.affine[:3, 3]
-    assert middle == pytest.approx([3.0, -4.0, 5.0], abs=1e-3)
+    assert centroid(volume) == pytest.approx([3.0, -4.0, 5.0], abs=1e-3)
 
 
 def test_modifier_and_turned_scaled_mirrored_parent():

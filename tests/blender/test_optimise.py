@@ -14,7 +14,7 @@ from mphdrr.addon.blender import jobs
 from mphdrr.addon.scanner import optimising, scanner
 from mphdrr.core.cli import main
 
-from .conftest import refused, update
+from .conftest import assert_same, refused, update
 from .test_jobs import everything
 
 pytest.importorskip("scipy", reason="no scipy")
@@ -49,7 +49,6 @@ starts = 1
 coarse_steps = 3
 steps = 1
 """
-FIELDS = ("numbers", "centers", "tilt", "pinhole_diameter", "collimator_length", "detector_side", "roi_radius")
 
 
 @pytest.fixture(scope="module")
@@ -81,18 +80,16 @@ def like(found):
     return found.start.replace(pinhole_diameter=np.full(6, 3.3), roi_radius=np.full(6, 20.0))
 
 
-def same(one: mph.PinholeSystem, other: mph.PinholeSystem) -> bool:
-    return all(np.array_equal(getattr(one, name), getattr(other, name)) for name in FIELDS)
-
-
 def test_the_scene_is_what_script_and_command_find(scene, recipe, found, tmp_path):
     assert bpy.ops.mphdrr.optimise(filepath=str(recipe)) == {"FINISHED"}
     collection = scanner.active_scanner(scene)
-    assert collection.name == "small" and same(scanner.read_scanner(collection), found.system)
+    assert collection.name == "small"
+    assert_same(scanner.read_scanner(collection), found.system)
     assert main(["design", "optimize", str(recipe), "-o", str(tmp_path / "command.xlsx"), "--quiet"]) == 0
     bpy.ops.mphdrr.export_geometry(filepath=str(tmp_path / "window.xlsx"))
     command, window = (mph.read_system(tmp_path / f"{name}.xlsx") for name in ("command", "window"))
-    assert same(command, window) and np.allclose(window.centers, found.system.centers, rtol=2e-9)
+    assert_same(command, window)
+    assert np.allclose(window.centers, found.system.centers, rtol=2e-9)
     lines = json.loads(collection.mphdrr_scanner.design)
     assert lines == found.summary() and "at the start, now" in lines[-2]
 
@@ -103,7 +100,8 @@ def test_a_scanner_with_these_modules_becomes_it(scene, recipe, found, at_once, 
     cameras = scanner.modules(scanner.active_scanner(scene))
     bpy.ops.mphdrr.optimise(filepath=str(recipe))
     (collection,) = scanner.scanners(scene)
-    assert scanner.modules(collection) == cameras and same(scanner.read_scanner(collection), found.system)
+    assert scanner.modules(collection) == cameras
+    assert_same(scanner.read_scanner(collection), found.system)
     assert scanner.losses(collection) == ["a design that no workbook has"]
     bpy.ops.mphdrr.export_geometry(filepath=str(tmp_path / "new.xlsx"))
     assert scanner.losses(collection) == []
@@ -113,8 +111,8 @@ def test_one_of_other_modules_stays_beside_it(scene, recipe, found, at_once, rin
     ring = scanner.build_scanner(scene, ring_system, "small")
     bpy.ops.mphdrr.optimise(filepath=str(recipe))
     assert [c.mphdrr_scanner.scanner_name for c in scanner.scanners(scene)] == ["small", "small 2"]
-    assert same(scanner.read_scanner(ring), ring_system)
-    assert same(scanner.read_scanner(scanner.active_scanner(scene)), found.system)
+    assert_same(scanner.read_scanner(ring), ring_system)
+    assert_same(scanner.read_scanner(scanner.active_scanner(scene)), found.system)
 
 
 def moved(scene, recipe, looks: int) -> tuple[jobs.Job, list[mph.PinholeSystem]]:
@@ -170,9 +168,10 @@ def test_one_undo_takes_it_back(scene, recipe, found, at_once, like):
     bpy.ops.ed.undo_push(message="optimised")
     bpy.ops.ed.undo()
     collection = scanner.active_scanner(bpy.context.scene)
-    assert same(scanner.read_scanner(collection), like) and not collection.mphdrr_scanner.design
+    assert not collection.mphdrr_scanner.design
+    assert_same(scanner.read_scanner(collection), like)
     bpy.ops.ed.redo()
-    assert same(scanner.read_scanner(scanner.active_scanner(bpy.context.scene)), found.system)
+    assert_same(scanner.read_scanner(scanner.active_scanner(bpy.context.scene)), found.system)
 
 
 def test_faults_are_said_and_marked(scene, recipe, tmp_path):

@@ -22,7 +22,7 @@ from mphdrr.core.phantoms.phantom import Phantom
 from mphdrr.core.projector import Projector
 from mphdrr.core.volumes.volume import Volume
 
-from .conftest import refused, reopened
+from .conftest import datablocks, refused, reopened
 
 THORAX = Path(__file__).parents[2] / "examples" / "phantoms" / "thorax.toml"
 POSE = {"location": (4.0, -5.0, 6.0), "phi": 0.5, "theta": 0.25, "psi": -0.125}  # whole in float32
@@ -69,6 +69,10 @@ def test_every_kind_is_core_s_at_its_pose(kind):
 def test_arguments_are_the_fields_of_the_class():
     item = add("points", voxels=16, counts=(1, 2, 3), spacing=(9, 8, 7), diameter=2, point_activity=3)
     assert phantoms.settings_of(item).phantom() == KINDS[5].phantom((1, 2, 3), (9, 8, 7), 2, 3)
+    item = add("derenzo", voxels=32, voxel_size=3, radius=40, rod_diameters=(8, 6, 5, 4, 3, 2), height=30, activity=50)
+    phantom = KINDS[0].phantom(40.0, (8.0, 6.0, 5.0, 4.0, 3.0, 2.0), 30.0, 50.0)
+    assert np.array_equal(voxels_of(item), phantom.voxelize(Grid.centered(32, 3.0)).array)
+    assert item.mphdrr_volume.kind == "DERENZO" and item.data.grids.load() and not item.data.grids.error_message
     item = add("shepp-logan", voxels=16, contrast="original", quantity="mu")
     assert item.mphdrr_volume.quantity == "mu"
     assert np.array_equal(voxels_of(item), expected(KINDS[4].phantom(contrast="original"), 16, "mu").array)
@@ -116,13 +120,22 @@ def test_settings_that_cannot_be_leave_the_voxels_and_say_why():
     assert np.array_equal(voxels_of(item), before)
     settings.spacing = 9.0
     assert not item.mphdrr_volume.message and not np.array_equal(voxels_of(item), before)
-    objects = len(bpy.data.objects), len(bpy.data.volumes)
-    refused(bpy.ops.mphdrr.add_torso, "defect from", defect_from=0.9)
-    refused(bpy.ops.mphdrr.add_points, "grid of points has no mu", voxels=8, attenuation=True)
-    assert (len(bpy.data.objects), len(bpy.data.volumes)) == objects
     item = add("points", voxels=12)
     item.mphdrr_volume.points.quantity = "mu"
     assert "has no mu" in item.mphdrr_volume.message and item.mphdrr_volume.quantity == "activity"
+
+
+def test_phantoms_that_cannot_be_are_refused_and_add_nothing():
+    before = datablocks("objects", "volumes")
+    for operator, words, settings in (
+        (bpy.ops.mphdrr.add_torso, "defect from", {"defect_from": 0.9}),
+        (bpy.ops.mphdrr.add_points, "grid of points has no mu", {"voxels": 8, "attenuation": True}),
+        (bpy.ops.mphdrr.add_derenzo, "rod", {"rod_diameters": (0.0,) * 6}),
+        (bpy.ops.mphdrr.add_derenzo, "rod", {"radius": 1.0}),
+        (bpy.ops.mphdrr.add_derenzo, "memory", {"voxels": 4096}),
+    ):
+        refused(operator, words, **settings)
+    assert datablocks("objects", "volumes") == before
 
 
 def test_settings_survive_saving_and_copies_follow_their_own(tmp_path):
@@ -163,9 +176,9 @@ def test_toml_that_is_no_phantom_adds_nothing(text, message, tmp_path):
     file = tmp_path / "a.toml"
     if text is not None:
         file.write_text(text)
-    before = len(bpy.data.objects), len(bpy.data.texts)
+    before = datablocks("objects", "texts")
     refused(bpy.ops.mphdrr.import_phantom, rf"a\.toml.*{message}", filepath=str(file))
-    assert (len(bpy.data.objects), len(bpy.data.texts)) == before
+    assert datablocks("objects", "texts") == before
 
 
 @pytest.mark.long
@@ -185,9 +198,8 @@ def test_applied_pose_keeps_activity_and_projections(ring_system, scale):
     assert total(volume) == pytest.approx(phantom.total_activity * np.linalg.det(placed[:3, :3]), rel=1e-3)
     np.testing.assert_allclose(volumes.pose_of_object(item)[:3, :3], np.eye(3), atol=1e-6)
     np.testing.assert_allclose(volumes.pose_of_object(item)[:3, 3], placed[:3, 3], atol=1e-5)
-    np.testing.assert_allclose(
-        volume.grid.affine[:3, :3], np.diag(volume.grid.spacing), atol=1e-6 * volume.grid.spacing[0]
-    )
+    spacing = volume.grid.spacing
+    np.testing.assert_allclose(volume.grid.affine[:3, :3], np.diag(spacing), atol=1e-6 * spacing[0])
     mu = volumes.volume_from_object(item.children[0])
     np.testing.assert_allclose(mu.grid.affine, volume.grid.affine, atol=1e-5)
     assert mu.array.max() == pytest.approx(largest_mu)

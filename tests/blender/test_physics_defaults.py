@@ -89,9 +89,8 @@ def test_a_recipe_says_the_model_whatever_its_volume_holds(settings, objects, tm
     assert settings.volume == objects["activity"] and settings.model == "TRANSMISSION"
 
 
-def test_all_modules_or_a_range_of_real_numbers(scene, settings, ring_system):
+def test_all_modules_or_a_range_of_real_numbers(ring, settings, ring_system):
     assert settings.all_modules
-    scanner.build_scanner(scene, ring_system)
     settings.all_modules = False
     assert (settings.first, settings.last) == (min(ring_system.numbers), max(ring_system.numbers))
     settings.first = 3

@@ -20,11 +20,9 @@ from .conftest import update
 
 
 @pytest.fixture
-def scanned(scene, ring_system):
+def scanned(ring, derenzo, ring_system):
     """A scanner of eight modules, the third one active, and a small phantom, off centre and rotated."""
-    collection = scanner.build_scanner(scene, ring_system, "Ring")
-    bpy.ops.mphdrr.add_derenzo(voxels=32, rod_diameters=(10, 8, 0, 0, 0, 0), location=(5, -3, 2), phi=0.2, theta=0.3)
-    selection.select(bpy.context, [scanner.module(collection, 3)])
+    selection.select(bpy.context, [scanner.module(ring, 3)])
     return ring_system
 
 

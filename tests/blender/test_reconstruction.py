@@ -20,7 +20,6 @@ from mphdrr.addon.reconstruction.reconstruction_properties import (
     voxels_recipe,
 )
 from mphdrr.addon.volumes import slices, volumes
-from mphdrr.core.progress import Cancelled
 from mphdrr.core.reconstruction.method_files import METHOD_FILES
 from mphdrr.core.reconstruction.methods import METHODS, Method
 from mphdrr.core.runs.files import read_run
@@ -28,7 +27,7 @@ from mphdrr.core.runs.run_recipe import run_truth
 from mphdrr.core.runs.settings import SETTINGS
 from mphdrr.core.volumes.sights import bright_value, full_slices
 
-from .conftest import Drawn, datablocks, refused
+from .conftest import Drawn, cancelled, datablocks, refused
 
 SMALL = {"voxels": 14, "spacing": 7.0, "iterations": 3, "subsets": 2}
 
@@ -100,8 +99,11 @@ def test_panel_settings_count_and_scripts_override_them(render, scene):
     panel.method, panel.iterations, panel.voxels, panel.spacing = "MLEM", 2, 10, 9.0
     assert bpy.ops.mphdrr.reconstruct() == {"FINISHED"}
     assert panel.details["title"] == "MLEM, 2 iterations" and reconstructed().mphdrr_volume.shape[:] == (10, 10, 10)
+    first = reconstructed()
     assert bpy.ops.mphdrr.reconstruct(iterations=1) == {"FINISHED"}
     assert panel.details["title"] == "MLEM, 1 iteration"
+    assert first.name in bpy.data.objects and reconstructed() != first, "a second one stands beside the first"
+    assert not np.allclose(voxels_of(first), voxels_of(reconstructed()))
     refused(bpy.ops.mphdrr.reconstruct, r"Subsets needs Method OSEM", subsets=2)
     refused(bpy.ops.mphdrr.reconstruct, "Weight: missing", prior="QUADRATIC")
 
@@ -115,9 +117,8 @@ def test_the_panel_untouched_gives_each_method_its_own_defaults(name, scene):
     assert given.pop("method", "osem") == name
     assert all(value == own[each] for each, value in given.items() if each in own)
     assert own.keys() - {"prior", "weight"} <= dict(panel_properties(panel)).keys()
-    assert f"OSEM 10, MLEM 50, BSREM 30, SIRT {METHODS['sirt'].own['iterations']}" in (
-        panel.bl_rna.properties["iterations"].description
-    )
+    description = panel.bl_rna.properties["iterations"].description
+    assert f"OSEM 10, MLEM 50, BSREM 30, SIRT {METHODS['sirt'].own['iterations']}" in description
 
 
 @pytest.mark.long
@@ -214,25 +215,22 @@ def job_of(scene) -> jobs.Job:
     panel = scene.mphdrr_reconstruction
     for name, value in SMALL.items():
         setattr(panel, name, value)
-    return reconstructions.reconstruct_job(
-        bpy.context, settings_recipe(lambda name: getattr(panel, name), lambda name: False)
-    )
+    recipe = settings_recipe(lambda name: getattr(panel, name), lambda name: False)
+    return reconstructions.reconstruct_job(bpy.context, recipe)
 
 
 def test_it_is_shown_while_it_runs_and_cancelled_without_a_trace(render, scene, in_window):
     before = state()
     job, seen = job_of(scene), []
 
-    def progress(done: int, total: int) -> None:
+    def has_two(done: int, total: int) -> bool:
         job.refresh()  # the window does so from time to time
         if reconstructed() is not None:
             seen.append(len(scene.mphdrr_reconstruction.details["objective"]))
             assert scene.mphdrr_reconstruction.details["scores"] == []
-            if seen[-1] == 2:
-                raise Cancelled
+        return seen[-1:] == [2]
 
-    with pytest.raises(Cancelled):
-        jobs.run(job, progress)
+    cancelled(job, has_two)
     assert sorted(set(seen)) == [1, 2]
     assert state() == before and reconstructed() is None and not bpy.data.objects["Derenzo"].hide_get()
 
@@ -259,13 +257,11 @@ def test_continue_goes_on_as_if_there_had_been_no_break(render, scene, in_window
     array = voxels_of(first)
     job = reconstructions.continue_job(bpy.context)
 
-    def cancel(done: int, total: int) -> None:
+    def is_late(done: int, total: int) -> bool:
         job.refresh()
-        if len(scene.mphdrr_reconstruction.details["objective"]) > 4:
-            raise Cancelled
+        return len(scene.mphdrr_reconstruction.details["objective"]) > 4
 
-    with pytest.raises(Cancelled):
-        jobs.run(job, cancel)
+    cancelled(job, is_late)
     assert scene.mphdrr_reconstruction.record == record and reconstructed() == first
     np.testing.assert_array_equal(voxels_of(first), array)
     in_window.undo()
@@ -296,14 +292,6 @@ def test_continue_goes_on_after_files_were_moved_and_opened_again(render, scene,
     refused(bpy.ops.mphdrr.continue_reconstruction, "poll")
 
 
-def test_a_second_one_stands_beside_the_first(render, scene):
-    bpy.ops.mphdrr.reconstruct(**SMALL)
-    first = reconstructed()
-    bpy.ops.mphdrr.reconstruct(**SMALL | {"iterations": 1})
-    assert reconstructed() != first and first.name in bpy.data.objects
-    assert not np.allclose(voxels_of(first), voxels_of(reconstructed()))
-
-
 def test_the_scenes_attenuation_is_modelled_and_missed(render, scene):
     bpy.ops.mphdrr.add_derenzo(voxels=12, cylinder_radius=45.0, cylinder_height=60.0, quantity="mu", background=0.0)
     mu = bpy.context.object
@@ -320,9 +308,8 @@ def test_the_scenes_attenuation_is_modelled_and_missed(render, scene):
 def test_the_panel_draws_the_result(render, scene):
     bpy.ops.mphdrr.reconstruct(**SMALL | {"spacing": 4.0})  # not much more than that of the run
     texts = Drawn("MPHDRR_PT_reconstruction").texts
-    assert {"OSEM, 3 iterations", "Log-likelihood", "NRMSE", "Show Slices", "Continue (+10)", "Reconstruct"} <= set(
-        texts
-    )
+    shown = {"OSEM, 3 iterations", "Log-likelihood", "NRMSE", "Show Slices", "Continue (+10)", "Reconstruct"}
+    assert shown <= set(texts)
     assert any(text.startswith("8 mm") for text in texts)
     flatters = " ".join(scene.mphdrr_reconstruction.details["flatters"])
     assert flatters and set(flatters.split()) <= set(" ".join(texts).split()), "the warning stays with the score"
@@ -377,11 +364,5 @@ def test_a_cancelled_back_projection_leaves_everything_as_it_was(render, scene):
     before = state()
     panel = scene.mphdrr_reconstruction
     job = backprojections.backproject_job(bpy.context, voxels_recipe(lambda name: getattr(panel, name)), "product")
-
-    def progress(done: int, total: int) -> None:
-        if done and total:
-            raise Cancelled
-
-    with pytest.raises(Cancelled):
-        jobs.run(job, progress)
+    cancelled(job, lambda done, total: bool(done and total))
     assert state() == before

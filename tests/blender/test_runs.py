@@ -22,7 +22,7 @@ from mphdrr.core.runs.recipe import Recipe
 from mphdrr.core.runs.run_recipe import run_recipe
 from mphdrr.core.volumes.volume import Volume
 
-from .conftest import Drawn, module, refused, update
+from .conftest import Drawn, module, move, refused, turn, update
 
 
 @pytest.fixture
@@ -38,16 +38,6 @@ def render(scene, derenzo):
         return settings.runs[-1]
 
     return now
-
-
-def move(item: bpy.types.Object, distance: float) -> None:
-    item.location.z += distance
-    update()
-
-
-def turn(item: bpy.types.Object, angle: float) -> None:
-    item.rotation_euler.y += angle
-    update()
 
 
 def shown_array(number: int = 3) -> np.ndarray:
@@ -68,9 +58,9 @@ def phantom() -> bpy.types.Object:
 
 
 EDITS = {
-    "Module 03 moved": (lambda: move(module(3), 1.0), lambda: move(module(3), -1.0)),
-    "Module 04 turned": (lambda: turn(module(4), 0.01), lambda: turn(module(4), -0.01)),
-    "modules 3, 5 moved": (lambda: (move(module(3), 1.0), move(module(5), 2.0)), None),
+    "Module 03 moved": (lambda: move(module(3), z=1.0), lambda: move(module(3), z=-1.0)),
+    "Module 04 turned": (lambda: turn(module(4), y=0.01), lambda: turn(module(4), y=-0.01)),
+    "modules 3, 5 moved": (lambda: (move(module(3), z=1.0), move(module(5), z=2.0)), None),
     "Module 02: d 2.3 mm, now 2.3000002 mm": (
         lambda: setattr(module(2).mphdrr_module, "pinhole_diameter", 2.3000002),
         lambda: setattr(module(2).mphdrr_module, "pinhole_diameter", 2.3),
@@ -78,7 +68,7 @@ EDITS = {
     "all modules: Ld 48 mm, now 47 mm": (
         lambda: setattr(scanner.active_scanner(bpy.context.scene).mphdrr_scanner, "detector_side", 47.0), None,
     ),
-    "phantom Derenzo moved": (lambda: move(phantom(), 0.001), lambda: move(phantom(), -0.001)),
+    "phantom Derenzo moved": (lambda: move(phantom(), z=0.001), lambda: move(phantom(), z=-0.001)),
     "phantom Derenzo turned": (lambda: setattr(phantom().rotation_euler, "x", 0.5), None),
     "phantom Derenzo changed": (
         lambda: setattr(phantom().mphdrr_volume.derenzo, "activity", 50.0),
@@ -126,7 +116,7 @@ def test_a_module_moved_by_a_millimetre_is_said_by_panels_list_and_export(render
     before = array_of(item)
     quiet = [Drawn(name).texts for name in ("MPHDRR_PT_next_step", "MPHDRR_PT_runs", "MPHDRR_PT_export")]
     assert not any("moved" in text for texts in quiet for text in texts)
-    move(module(3), 1.0)
+    move(module(3), z=1.0)
     names = "MPHDRR_PT_next_step", "MPHDRR_PT_runs", "MPHDRR_PT_runs_of_images", "MPHDRR_PT_export"
     for name in names:
         assert "Module 03 moved" in " ".join(Drawn(name).texts), name
@@ -167,7 +157,7 @@ def test_the_list_keeps_two_and_what_is_renamed_or_pinned(render, scene):
 def test_choosing_a_run_shows_its_images_and_removing_it_removes_its_file(render, scene):
     settings = scene.mphdrr_projections
     old = array_of(render())
-    move(phantom(), 6.0)
+    move(phantom(), z=6.0)
     new = array_of(render())
     assert np.array_equal(shown_array(), new[2]) and not np.array_equal(old, new)
     settings.active_run = 0
@@ -186,7 +176,7 @@ def test_choosing_a_run_shows_its_images_and_removing_it_removes_its_file(render
 
 def test_two_runs_survive_save_and_reopen(render, scene, tmp_path):
     before = [array_of(render("one"))]
-    move(module(3), 1.0)
+    move(module(3), z=1.0)
     before.append(array_of(render()))
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "study.blend"))
     shutil.move(tmp_path, moved := tmp_path.with_name(tmp_path.name + "-moved"))
@@ -198,7 +188,7 @@ def test_two_runs_survive_save_and_reopen(render, scene, tmp_path):
     for item, expected in zip(settings.runs, before, strict=True):
         assert np.array_equal(array_of(item), expected)
     assert runs.changes(scene) == [] and runs.changes(scene, settings.runs[0]) == ["Module 03 moved"]
-    move(module(3), -1.0)
+    move(module(3), z=-1.0)
     assert runs.changes(scene, settings.runs[0]) == [] and runs.changes(scene) == ["Module 03 moved"]
     settings.active_run = 0
     assert np.array_equal(shown_array(), before[0][2])
@@ -239,7 +229,7 @@ def test_a_run_whose_file_is_gone_is_said_and_does_not_stop_saving(render, scene
 
 def test_the_difference_of_two_runs_is_drawn_and_said(render, scene, capfd):
     settings = scene.mphdrr_projections
-    render(), move(phantom(), 3.0), render()
+    render(), move(phantom(), z=3.0), render()
     found = difference(*(read_run(storage.absolute(settings.runs[i].file)) for i in (1, 0)))
     assert bpy.ops.mphdrr.compare_runs(other="0") == {"FINISHED"}
     assert found.maximum > 0 and found.text in capfd.readouterr().out
@@ -264,12 +254,11 @@ def test_the_example_is_current(scene):
     np.testing.assert_allclose(run.volume.grid.affine, shown.grid.affine, atol=1e-4)
     (again,) = run_recipe(run.recipe, run.system)
     np.testing.assert_allclose(again.projections, run.projections, rtol=1e-3, atol=1e-3 * run.projections.max())
-    move(module(30), 1.0)
+    move(module(30), z=1.0)
     assert runs.changes(scene) == ["Module 30 moved"] and runs.stale_modules(scene) == {30}
 
 
-def test_runs_from_outside_set_the_panel_and_say_what_the_scene_lacks(scene, ring_system, tmp_path):
-    collection = scanner.build_scanner(scene, ring_system)
+def test_runs_from_outside_set_the_panel_and_say_what_the_scene_lacks(scene, ring, ring_system, tmp_path):
     small = {"phantom.voxels": 12, "detector.rows": 6, "detector.columns": 8, "model.kind": "emission"}
     for number, (given, expected) in enumerate((
         ({}, []), ({"attenuation.of_phantom": True, "phantom.kind": "nema"}, ["attenuation of Nema phantom, now none"]),
@@ -280,7 +269,7 @@ def test_runs_from_outside_set_the_panel_and_say_what_the_scene_lacks(scene, rin
         rendering.show_run(scene, run, path, item)
         assert scene.mphdrr_projections.width == 8 and runs.changes(scene) == expected
     module(3).location.x += 1
-    assert runs.changes(scene)[0] == "Module 03 moved" and collection.mphdrr_scanner.count == 8
+    assert runs.changes(scene)[0] == "Module 03 moved" and ring.mphdrr_scanner.count == 8
 
 
 def test_a_volume_that_is_not_in_the_panel_is_found_again(render, scene):

@@ -15,29 +15,21 @@ from mphdrr.addon.blender import objects
 from mphdrr.addon.scanner import cameras, scanner
 from mphdrr.core.errors import InputError
 from mphdrr.core.geometry.collimator import Construction
-from mphdrr.core.geometry.system import LENGTHS, PinholeSystem
 
-from .conftest import reopened, update
+from .conftest import assert_same, datablocks, reopened, update
 
-
-def counts() -> dict[str, int]:
-    kinds = ("objects", "meshes", "cameras", "materials", "collections")
-    return {kind: len(getattr(bpy.data, kind)) for kind in kinds}
+KINDS = ("objects", "meshes", "cameras", "materials", "collections")
 
 
-def assert_same(a: PinholeSystem, b: PinholeSystem) -> None:
-    for name in ("centers", "numbers", *LENGTHS):
-        assert np.array_equal(getattr(a, name), getattr(b, name)), name
-
-
-def test_registers_twice():
-    registration.unregister()
-    assert not hasattr(bpy.types.Object, "mphdrr_module")
-    for _ in range(2):
-        registration.register()
+def test_registers_twice_and_its_handlers_come_and_go_once():
+    lists = {id(handlers): handlers for handlers, _ in registration.HANDLERS}.values()
+    lengths = [len(handlers) for handlers in lists]
+    for _ in range(3):
         registration.unregister()
-    assert not hasattr(bpy.types, "MPHDRR_PT_geometry")
-    registration.register()
+        assert [len(handlers) for handlers in lists] != lengths
+        assert not hasattr(bpy.types.Object, "mphdrr_module") and not hasattr(bpy.types, "MPHDRR_PT_geometry")
+        registration.register()
+        assert [len(handlers) for handlers in lists] == lengths
 
 
 def test_failed_registration_leaves_nothing(monkeypatch):
@@ -80,93 +72,50 @@ def test_camera_axes_follow_the_module_frame(scene, ring_system):
         assert camera.rotation_euler.y == 0.0
 
 
-def test_unchanged_scanner_reads_back_exactly(scene, ring_system, dc_spect):
-    assert_same(scanner.read_scanner(scanner.build_scanner(scene, ring_system, "A")), ring_system)
-    collection = scanner.build_scanner(scene, dc_spect)
-    update()
-    back = scanner.read_scanner(collection)
-    assert_same(back, dc_spect)
-    assert back.source == dc_spect.source
-    assert scanner.losses(collection) == []
-
-
-def test_unsorted_numbers_keep_their_order(scene, ring_system):
-    system = ring_system[np.array([5, 0, 7, 2])]
-    assert_same(scanner.read_scanner(scanner.build_scanner(scene, system, "A")), system)
-
-
-def test_scanner_survives_saving(scene, dc_spect, tmp_path):
+def test_unchanged_scanner_reads_back_exactly_also_from_a_file(scene, ring_system, dc_spect, tmp_path):
+    for system in (ring_system, ring_system[np.array([5, 0, 7, 2])]):  # unsorted numbers keep their order
+        assert_same(scanner.read_scanner(scanner.build_scanner(scene, system, "A", replace=True)), system)
     scanner.build_scanner(scene, dc_spect)
-    path = str(tmp_path / "scanner.blend")
-    reopened(path)
-    collection = scanner.active_scanner(bpy.context.scene)
-    back = scanner.read_scanner(collection)
-    assert_same(back, dc_spect)
-    assert back.source == dc_spect.source
+    update()
+    for is_reopened in (False, True):
+        if is_reopened:
+            scene = reopened(tmp_path / "scanner.blend")
+        collection = scanner.active_scanner(scene)
+        back = scanner.read_scanner(collection)
+        assert_same(back, dc_spect)
+        assert back.source == dc_spect.source and scanner.losses(collection) == []
 
 
-def test_moved_camera_and_edited_number_are_read(scene, ring_system):
-    collection = scanner.build_scanner(scene, ring_system)
-    third = scanner.module(collection, 3)
+def test_moved_camera_and_edited_number_are_read(ring, ring_system):
+    third = scanner.module(ring, 3)
     third.location.z += 5.0
-    scanner.module(collection, 4).mphdrr_module.pinhole_diameter = 3.0
-    back = scanner.read_scanner(collection)
+    scanner.module(ring, 4).mphdrr_module.pinhole_diameter = 3.0
+    back = scanner.read_scanner(ring)
     assert np.allclose(back.centers[2], ring_system.centers[2] + [0, 0, 5], atol=2e-5)
     assert np.array_equal(np.delete(back.centers, 2, axis=0), np.delete(ring_system.centers, 2, axis=0))
     assert back.pinhole_diameter.tolist() == [2.3, 2.3, 2.3, 3.0, 2.3, 2.3, 2.3, 2.3]
     assert back.source is None
-    assert not back.tilt.any() and scanner.aim_modules(collection) == []
+    assert not back.tilt.any() and scanner.aim_modules(ring) == []
     assert np.allclose(objects.world_matrix(third), cameras.camera_matrices(back.poses())[2], atol=2e-5)
 
 
-def test_hidden_or_parented_camera_is_read_where_it_is(scene, ring_system):
-    collection = scanner.build_scanner(scene, ring_system)
-    scanner.show_modules(collection, 1, 1, "ONLY")
+def test_hidden_or_parented_camera_is_read_where_it_is(scene, ring, ring_system):
+    scanner.show_modules(ring, 1, 1, "ONLY")
     update()
     bench = bpy.data.objects.new("Bench", None)
     scene.collection.objects.link(bench)
     bench.location = (0, 0, 12.5)
-    for camera in scanner.modules(collection):
+    for camera in scanner.modules(ring):
         camera.parent = bench
-    back = scanner.read_scanner(collection)
+    back = scanner.read_scanner(ring)
     assert np.allclose(back.centers, ring_system.centers + np.array([0, 0, 12.5]), atol=5e-5)
 
 
-def test_children_follow_the_camera(scene, ring_system):
-    camera = scanner.module(scanner.build_scanner(scene, ring_system), 2)
-    camera.location.x += 40.0
-    camera.rotation_euler.z += 0.3
-    update()
-    assert sorted(c.mphdrr_module.part for c in camera.children) == ["COLLIMATOR", "CRYSTAL"]
-    for child in camera.children:
-        assert np.allclose(child.matrix_world, camera.matrix_world, atol=1e-6)
-
-
-def test_edited_module_is_rebuilt_with_its_numbers(scene, ring_system):
-    collection = scanner.build_scanner(scene, ring_system)
-    before = counts()
-    camera = scanner.module(collection, 2)
-    camera.mphdrr_module.collimator_length = 80.0
-    camera.mphdrr_module.detector_side = 40.0
-    assert camera.data.lens / camera.data.sensor_width == pytest.approx(2.0)
-    crystal = next(c for c in camera.children if c.mphdrr_module.part == "CRYSTAL")
-    z = [v.co.z for v in crystal.data.vertices]
-    assert (min(z), max(z)) == pytest.approx((80.0, 89.5))
-    assert counts() == before
-    camera.mphdrr_module.pinhole_diameter = 500.0  # impossible: refused when read, but nothing breaks
-    with pytest.raises(InputError, match="module 2"):
-        scanner.read_scanner(collection)
-
-
-def test_importing_again_leaves_no_orphans(scene, ring_system):
-    scanner.build_scanner(scene, ring_system)
-    before = counts()
-    names = sorted(o.name for o in bpy.data.objects)
+def test_importing_again_leaves_no_orphans(scene, ring, ring_system):
+    before = datablocks(*KINDS)
     for _ in range(2):
-        scanner.build_scanner(scene, ring_system)
-    assert counts() == before
-    assert sorted(o.name for o in bpy.data.objects) == names
-    assert all(mesh.users for mesh in bpy.data.meshes)
+        scanner.build_scanner(scene, ring_system, "Ring")
+    assert datablocks(*KINDS) == before and all(mesh.users for mesh in bpy.data.meshes)
 
 
 def test_scanners_of_different_names_coexist(scene, ring_system):
@@ -195,10 +144,10 @@ def test_replacing_asks_for_what_would_be_lost_and_keeps_what_is_the_users(scene
     scanner.module(collection, 6).mphdrr_module.detector_side = 47.0
     scene.camera = camera
 
-    before = counts()
+    before = datablocks(*KINDS)
     with pytest.raises(InputError) as error:
         scanner.build_scanner(scene, ring_system, "One")
-    assert counts() == before
+    assert datablocks(*KINDS) == before
     for phrase in ("module 5 moved", "module 6 with changed", "My lamp", "My folder", copy.name, "replace=True"):
         assert phrase in str(error.value)
     assert "\n" not in str(error.value)
@@ -216,55 +165,52 @@ def test_replacing_asks_for_what_would_be_lost_and_keeps_what_is_the_users(scene
     assert scanner.losses(again) == []
 
 
-def test_deleted_module_is_named_as_a_loss_and_two_of_one_number_are_refused(scene, ring_system):
-    collection = scanner.build_scanner(scene, ring_system)
-    copy = scanner.module(collection, 2).copy()
-    collection.objects.link(copy)
+def test_deleted_module_is_named_as_a_loss_and_two_of_one_number_are_refused(ring):
+    copy = scanner.module(ring, 2).copy()
+    ring.objects.link(copy)
     with pytest.raises(InputError, match=r"'Module 02' and 'Module 02.001' both have module number 2"):
-        scanner.read_scanner(collection)
+        scanner.read_scanner(ring)
     bpy.data.objects.remove(copy)
-    bpy.data.objects.remove(scanner.module(collection, 2))
-    assert scanner.losses(collection) == ["1 module deleted or moved out"]
-    assert scanner.read_scanner(collection).numbers.tolist() == [1, 3, 4, 5, 6, 7, 8]
+    bpy.data.objects.remove(scanner.module(ring, 2))
+    assert scanner.losses(ring) == ["1 module deleted or moved out"]
+    assert scanner.read_scanner(ring).numbers.tolist() == [1, 3, 4, 5, 6, 7, 8]
 
 
-def test_failed_build_leaves_the_scene_as_it_was(scene, ring_system, monkeypatch):
-    scanner.build_scanner(scene, ring_system)
-    before = counts()
+def test_failed_build_leaves_the_scene_as_it_was(scene, ring, ring_system, monkeypatch):
+    before = datablocks(*KINDS)
     with pytest.raises(InputError, match="aperture plate"):
-        scanner.build_scanner(scene, ring_system, construction=Construction(60.0))
+        scanner.build_scanner(scene, ring_system, "Ring", construction=Construction(60.0))
     monkeypatch.setattr(cameras, "set_field_of_view", lambda *args: 1 / 0)
     with pytest.raises(ZeroDivisionError):
         scanner.build_scanner(scene, ring_system, "Other")
-    assert counts() == before
+    assert datablocks(*KINDS) == before
 
 
-def test_modules_are_shown_by_range(scene, ring_system):
-    collection = scanner.build_scanner(scene, ring_system)
+def test_modules_are_shown_by_range(scene, ring, ring_system):
 
     def visible() -> list[int]:
         shown = []
-        for camera in scanner.modules(collection):
+        for camera in scanner.modules(ring):
             states = {item.hide_viewport for item in (camera, *camera.children)}
             assert states == {item.hide_render for item in (camera, *camera.children)} and len(states) == 1
             if not camera.hide_viewport:
                 shown.append(camera.mphdrr_module.number)
         return shown
 
-    assert scanner.show_modules(collection, 2, 4) == 3
+    assert scanner.show_modules(ring, 2, 4) == 3
     assert visible() == [2, 3, 4]
-    scanner.show_modules(collection, 7, 9, "SHOW")
+    scanner.show_modules(ring, 7, 9, "SHOW")
     assert visible() == [2, 3, 4, 7, 8]
-    scanner.show_modules(collection, 1, 3, "HIDE")
+    scanner.show_modules(ring, 1, 3, "HIDE")
     assert visible() == [4, 7, 8]
-    scanner.module(collection, 4).mphdrr_module.visible = False
+    scanner.module(ring, 4).mphdrr_module.visible = False
     assert visible() == [7, 8]
-    scanner.build_scanner(scene, ring_system)
+    scanner.build_scanner(scene, ring_system, "Ring")
     assert visible() == [7, 8], "importing again keeps what is hidden"
-    scanner.show_modules(collection, 0, 0, "ALL")
+    scanner.show_modules(ring, 0, 0, "ALL")
     assert visible() == list(range(1, 9))
     with pytest.raises(InputError, match="no module between 9 and 20"):
-        scanner.show_modules(collection, 9, 20)
+        scanner.show_modules(ring, 9, 20)
 
 
 @pytest.mark.long
@@ -274,10 +220,8 @@ def test_python_ends_with_the_extension_registered():
     subprocess.run([sys.executable, "-c", script], check=True, timeout=600)
 
 
-def test_numbers_that_are_animated_or_driven_are_followed(scene, ring_system):
-    collection = scanner.build_scanner(scene, ring_system)
-    update()
-    keyed, driven = (scanner.module(collection, number) for number in (1, 2))
+def test_numbers_that_are_animated_or_driven_are_followed(scene, ring):
+    keyed, driven = (scanner.module(ring, number) for number in (1, 2))
     usual = [camera.mphdrr_module.sensitivity for camera in (keyed, driven)]
     for frame, diameter in ((1, 2.3), (10, 4.6)):
         keyed.mphdrr_module.pinhole_diameter = diameter

@@ -112,6 +112,5 @@ def test_meshes_in_blender_are_closed_and_look_outwards_in_materials_for_every_v
     for material in bpy.data.materials:
         if material.name.startswith("mphDRR"):
             shader = next(n for n in material.node_tree.nodes if n.type == "BSDF_PRINCIPLED")
-            assert tuple(material.diffuse_color)[:3] == pytest.approx(
-                tuple(shader.inputs["Base Color"].default_value)[:3]
-            )
+            base = shader.inputs["Base Color"].default_value
+            assert tuple(material.diffuse_color)[:3] == pytest.approx(tuple(base)[:3])

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import bmesh
 import bpy
 import numpy as np
 import pytest
@@ -16,7 +15,7 @@ from mphdrr.core.geometry.collimator import Construction
 from mphdrr.core.geometry.system import PinholeSystem
 from mphdrr.core.geometry.views import Views
 
-from .conftest import update
+from .conftest import assert_same, cycles_picture, move, reopened, turn, update
 
 
 def project(views: Views, points: np.ndarray) -> np.ndarray:
@@ -63,7 +62,7 @@ def test_module_on_the_axis(scene):
 
 
 @pytest.mark.parametrize("number", [14, 47])
-def test_markers_rendered_by_cycles_land_where_views_say(scene, dc_spect, number, tmp_path):
+def test_markers_rendered_by_cycles_land_where_views_say(scene, dc_spect, number):
     """Not mirrored and not upside down: the markers differ in size and have no symmetry."""
     shape = (96, 128)
     collection = scanner.build_scanner(scene, dc_spect, shape=shape)
@@ -72,10 +71,9 @@ def test_markers_rendered_by_cycles_land_where_views_say(scene, dc_spect, number
             bpy.data.objects.remove(item)
     markers = np.array([[28.0, 6.0, 35.0], [-17.0, 30.0, -22.0], [9.0, -31.0, 12.0]])
     for channel, center in enumerate(markers):  # red, green, blue
-        scene.collection.objects.link(emitting_sphere(center, 2.5, channel))
+        add_emitting_sphere(center, 2.5, channel)
     scene.camera = scanner.module(collection, number)
-    pixels = render(scene, tmp_path / "markers.exr")
-    as_arrays = pixels[:, ::-1]  # pictures have -u to the right; rows already grow along +v
+    as_arrays = cycles_picture(scene, samples=4)[:, ::-1]  # pictures have -u to the right; rows already grow along +v
     expected = project(dc_spect.views(shape=shape)[number - 1], markers)[0]
     for channel in range(3):
         weight = as_arrays[:, :, channel] * (as_arrays[:, :, channel] > 0.2)
@@ -85,12 +83,9 @@ def test_markers_rendered_by_cycles_land_where_views_say(scene, dc_spect, number
         assert np.abs(np.array(got) - expected[channel]).max() < 1.0
 
 
-def emitting_sphere(center: np.ndarray, radius: float, channel: int) -> bpy.types.Object:
-    mesh = bpy.data.meshes.new("Marker")
-    shape = bmesh.new()
-    bmesh.ops.create_icosphere(shape, subdivisions=3, radius=radius)
-    shape.to_mesh(mesh)
-    shape.free()
+def add_emitting_sphere(center: np.ndarray, radius: float, channel: int) -> None:
+    """Add a sphere to the scene that is bright in one channel of colour."""
+    bpy.ops.mesh.primitive_ico_sphere_add(subdivisions=3, radius=radius, location=center)
     material = bpy.data.materials.new("Marker")
     if material.node_tree is None:
         material.use_nodes = True
@@ -99,43 +94,17 @@ def emitting_sphere(center: np.ndarray, radius: float, channel: int) -> bpy.type
     emission, output = nodes.new("ShaderNodeEmission"), nodes.new("ShaderNodeOutputMaterial")
     emission.inputs["Color"].default_value = [float(i == channel) for i in range(3)] + [1.0]
     material.node_tree.links.new(emission.outputs[0], output.inputs["Surface"])
-    mesh.materials.append(material)
-    marker = bpy.data.objects.new("Marker", mesh)
-    marker.location = center
-    return marker
-
-
-def render(scene: bpy.types.Scene, path) -> np.ndarray:
-    """The scene by Cycles: (rows from the bottom, columns from the left, 3), linear."""
-    scene.render.engine = "CYCLES"
-    scene.cycles.device, scene.cycles.samples = "CPU", 4
-    scene.cycles.use_denoising = False
-    scene.cycles.max_bounces = 2
-    scene.world = None
-    scene.render.threads_mode, scene.render.threads = "FIXED", 2
-    settings = scene.render.image_settings
-    settings.file_format, settings.color_mode = "OPEN_EXR", "RGB"
-    scene.render.filepath = str(path)
-    bpy.ops.render.render(write_still=True)
-    image = bpy.data.images.load(str(path))
-    columns, rows = image.size
-    pixels = np.empty(columns * rows * 4, np.float32)
-    image.pixels.foreach_get(pixels)
-    return pixels.reshape(rows, columns, 4)[..., :3]
+    bpy.context.object.data.materials.append(material)
 
 
 @pytest.fixture
-def tilted(ring_system, rng) -> PinholeSystem:
+def tilted(ring_system) -> PinholeSystem:
     """Modules tilted by up to 3 degrees; one is not."""
+    rng = np.random.default_rng(5)
     vectors = rng.normal(size=(8, 3))
     vectors *= np.radians(rng.uniform(0.5, 3.0, 8))[:, None] / np.linalg.norm(vectors, axis=1)[:, None]
     vectors[5] = 0.0
     return ring_system.replace(tilt=vectors)
-
-
-@pytest.fixture
-def rng():
-    return np.random.default_rng(5)
 
 
 @pytest.fixture
@@ -147,16 +116,13 @@ def collection(scene, tilted):
 
 def test_it_is_read_back_exactly_also_from_a_file(collection, tilted, tmp_path):
     assert not collection.mphdrr_scanner.keep_aimed and scanner.losses(collection) == []
-    path = str(tmp_path / "tilted.blend")
-    bpy.ops.wm.save_as_mainfile(filepath=path)
-    for opened in (False, True):
-        if opened:
-            bpy.ops.wm.open_mainfile(filepath=path)
-        read = scanner.read_scanner(scanner.active_scanner(bpy.context.scene))
-        for name, values in tilted.values().items():
-            assert np.array_equal(read.values()[name], values), name
+    for is_reopened in (False, True):
+        if is_reopened:
+            collection = scanner.active_scanner(reopened(tmp_path / "tilted.blend"))
+        read = scanner.read_scanner(collection)
+        assert_same(read, tilted)
         assert np.array_equal(read.poses(), tilted.poses())
-    found = scanner.modules(scanner.active_scanner(bpy.context.scene))
+    found = scanner.modules(collection)
     assert [camera.mphdrr_module.aimed for camera in found] == [m == 5 for m in range(8)]
     assert not any(camera.mphdrr_module.problem for camera in found)
 
@@ -170,26 +136,22 @@ def test_cameras_see_along_the_rays_of_the_views(scene, collection, tilted):
         assert np.allclose(seen, expected, atol=3e-6)
 
 
-def test_turning_a_camera_tilts_its_module_and_aiming_it_takes_the_tilt(scene, ring_system):
-    collection = scanner.build_scanner(scene, ring_system)
-    update()
-    camera = scanner.module(collection, 4)
+def test_turning_a_camera_tilts_its_module_and_aiming_it_takes_the_tilt(ring, ring_system):
+    camera = scanner.module(ring, 4)
     before = camera.rotation_euler.copy()
-    camera.rotation_euler.y += 0.03
-    camera.rotation_euler.x -= 0.02
-    update()
-    read = scanner.read_scanner(collection)
+    turn(camera, y=0.03, x=-0.02)
+    read = scanner.read_scanner(ring)
     others = np.arange(8) != 3
     assert not read.tilt[others].any() and 0.03 < np.linalg.norm(read.tilt[3]) < 0.06
     assert np.array_equal(read.centers, ring_system.centers)
     assert np.allclose(read.poses()[3], cameras.module_poses(objects.world_matrix(camera)[None])[0], atol=1e-6)
-    assert scanner.losses(collection) == ["module 4 moved or turned"]
+    assert scanner.losses(ring) == ["module 4 moved or turned"]
     camera.rotation_euler = before
     update()
-    assert np.array_equal(scanner.read_scanner(collection).tilt, ring_system.tilt)
+    assert np.array_equal(scanner.read_scanner(ring).tilt, ring_system.tilt)
     camera.rotation_euler.y += 0.03
-    assert scanner.aim_modules(collection) == [4]
-    assert np.array_equal(scanner.read_scanner(collection).tilt, ring_system.tilt)
+    assert scanner.aim_modules(ring) == [4]
+    assert np.array_equal(scanner.read_scanner(ring).tilt, ring_system.tilt)
 
 
 def test_a_small_turn_of_a_tilted_module_is_not_lost_and_nothing_drifts(collection, tilted):
@@ -205,22 +167,19 @@ def test_a_small_turn_of_a_tilted_module_is_not_lost_and_nothing_drifts(collecti
 
 def test_a_tilted_module_that_is_only_moved_keeps_its_direction(collection, tilted):
     camera = scanner.module(collection, 2)
-    camera.location.z += 4.0
-    update()
+    move(camera, z=4.0)
     read = scanner.read_scanner(collection)
     assert np.allclose(read.frames()[1], tilted.frames()[1], rtol=0, atol=1e-12)
     collection.mphdrr_scanner.keep_aimed = True
-    camera.location.z += 1.0
-    update()
+    move(camera, z=1.0)
     assert not scanner.read_scanner(collection).tilt[1].any()
     assert np.array_equal(np.delete(scanner.read_scanner(collection).tilt, 1, 0), np.delete(tilted.tilt, 1, 0))
 
 
 def test_copies_along_the_ring_keep_the_tilt(collection, tilted):
     for follow_ring in (False, True):
-        (copy,) = module_edits.duplicate_modules(
-            collection, [scanner.module(collection, 3)], 1, 0.21 + follow_ring / 10, follow_ring
-        )
+        third, angle = [scanner.module(collection, 3)], 0.21 + follow_ring / 10
+        (copy,) = module_edits.duplicate_modules(collection, third, 1, angle, follow_ring)
         assert np.allclose(scanner.read_module(collection, copy).tilt, tilted.tilt[2], rtol=0, atol=1e-12)
 
 
@@ -234,10 +193,6 @@ def test_readouts_lines_of_sight_and_parts_are_of_the_tilted_module(scene, colle
     along = ends[:, 1] - ends[:, 0]
     assert np.allclose(along / np.linalg.norm(along, axis=1)[:, None], tilted.principal_rays, atol=1e-6)
     for part in tilted.parts():
-        item = next(
-            o
-            for o in scene.objects
-            if o.mphdrr_module.part == part.kind.upper() and o.mphdrr_module.number == part.number
-        )
+        item = bpy.data.objects[f"{part.kind.capitalize()} {part.number:02d}"]
         points = np.array([item.matrix_world @ v.co for v in item.data.vertices])
         assert np.allclose(points, part.vertices, atol=1e-4)

@@ -12,13 +12,11 @@ from mphdrr.addon.volumes import volumes
 from mphdrr.core.geometry.grid import Grid
 from mphdrr.core.volumes.volume import Volume
 
-from .conftest import Drawn, update
-
-KINDS = ("objects", "meshes", "cameras", "materials", "collections", "images")
+from .conftest import Drawn, datablocks, update
 
 
 def names() -> dict[str, list[str]]:
-    return {kind: sorted(item.name for item in getattr(bpy.data, kind)) for kind in KINDS}
+    return datablocks("objects", "meshes", "cameras", "materials", "collections", "images")
 
 
 def views() -> list[tuple]:
@@ -57,37 +55,28 @@ def test_a_removed_scanner_leaves_nothing_of_its_own(scene, ring_system):
     assert not bpy.ops.mphdrr.remove_scanner.poll()
 
 
-def test_cameras_that_were_edited_are_named_until_they_are_reset(scene, ring_system, monkeypatch):
-    collection = scanner.build_scanner(scene, ring_system)
-    camera = scanner.module(collection, 3)
+def test_cameras_that_were_edited_are_named_until_they_are_reset(ring, monkeypatch):
+    camera = scanner.module(ring, 3)
 
     def said() -> str:
         return " ".join(map(str, Drawn("MPHDRR_PT_design").calls))
 
     assert "reset_cameras" not in said()
-    for name, value in {
-        "lens": 77.0,
-        "sensor_width": 30.0,
-        "shift_x": 0.1,
-        "sensor_fit": "VERTICAL",
-        "type": "ORTHO",
-    }.items():
+    edits = {"lens": 77.0, "sensor_width": 30.0, "shift_x": 0.1, "sensor_fit": "VERTICAL", "type": "ORTHO"}
+    for name, value in edits.items():
         setattr(camera.data, name, value)
         update()
         assert "reset_cameras" in said() and "of 1 camera" in said(), name
         assert bpy.ops.mphdrr.reset_cameras() == {"FINISHED"}
         assert "reset_cameras" not in said(), name
-        module = camera.mphdrr_module
-        assert camera.data.lens / camera.data.sensor_width == pytest.approx(
-            module.collimator_length / module.detector_side, rel=1e-6
-        )
+        ratio = camera.mphdrr_module.collimator_length / camera.mphdrr_module.detector_side
+        assert camera.data.lens / camera.data.sensor_width == pytest.approx(ratio, rel=1e-6)
     camera.data.lens = 77.0
     camera.mphdrr_module.collimator_length = 61.0
     assert camera.data.lens == pytest.approx(61.0), "it follows l"
 
 
-def test_a_scene_of_other_units_is_set_up(scene, ring_system):
-    collection = scanner.build_scanner(scene, ring_system)
+def test_a_scene_of_other_units_is_set_up(scene, ring, ring_system):
     scene.unit_settings.scale_length = 1.0
     for _, _, space in framing._spaces():
         space.clip_end, space.region_3d.view_distance = 100.0, 10.0
@@ -99,18 +88,18 @@ def test_a_scene_of_other_units_is_set_up(scene, ring_system):
     assert spaces and all(s.clip_end > 10 * reach for s in spaces)
     turned = [s.region_3d.view_distance > reach for s in spaces if s.region_3d.view_perspective != "CAMERA"]
     assert turned and all(turned)
-    assert collection == scanner.active_scanner(scene)
+    assert ring == scanner.active_scanner(scene)
 
 
 def test_views_follow_the_undo_of_an_import_unless_they_were_turned(scene, ring_system):
     before = views()
-    collection = scanner.build_scanner(scene, ring_system)
+    ring = scanner.build_scanner(scene, ring_system)
     after = views()
     assert all(a != b for a, b in zip(before, after, strict=True))
 
     def undo(is_scanner: bool) -> None:
         framing.before_undo()
-        collection.mphdrr_scanner.is_scanner = is_scanner
+        ring.mphdrr_scanner.is_scanner = is_scanner
         framing.after_undo()
 
     undo(True)  # of something else
@@ -127,9 +116,8 @@ def test_views_follow_the_undo_of_an_import_unless_they_were_turned(scene, ring_
     assert sum(a != b for a, b in zip(views(), before, strict=True)) == 1
 
 
-def test_lines_of_sight_are_those_of_the_cameras(scene, ring_system):
-    collection = scanner.build_scanner(scene, ring_system)
-    bpy.context.view_layer.objects.active = scanner.module(collection, 3)
+def test_lines_of_sight_are_those_of_the_cameras(scene, ring, ring_system):
+    bpy.context.view_layer.objects.active = scanner.module(ring, 3)
     update()
     state = scene.mphdrr_geometry
     assert sight_lines.lines(bpy.context) == {}
@@ -138,17 +126,12 @@ def test_lines_of_sight_are_those_of_the_cameras(scene, ring_system):
     views_ = ring_system.views((16, 16), magnification=scene.mphdrr_projections.magnification)
     assert np.allclose(ray, [views_.sources[2], views_.detector_centers[2]], atol=1e-3)
     state.sight_all = True
-    scanner.show_modules(collection, 2, 8)
+    scanner.show_modules(ring, 2, 8)
     update()
     drawn = sight_lines.lines(bpy.context)
-    assert {name: len(ends) for name, ends in drawn.items()} == {
-        "show_rays": 7,
-        "show_frustums": 28,
-        "show_detectors": 28,
-    }
-    for m, camera in enumerate(scanner.modules(collection)[1:]):
+    assert [len(drawn[name]) for name in ("show_rays", "show_frustums", "show_detectors")] == [7, 28, 28]
+    for m, camera in enumerate(scanner.modules(ring)[1:]):
         seen = [world_to_camera_view(scene, camera, Vector(p)) for p in drawn["show_detectors"][4 * m : 4 * m + 4, 0]]
-        assert np.allclose(
-            sorted(p[:2] for p in np.round(seen, 3).tolist()), [(0, 0), (0, 1), (1, 0), (1, 1)], atol=2e-3
-        )
+        ends = sorted(p[:2] for p in np.round(seen, 3).tolist())
+        assert np.allclose(ends, [(0, 0), (0, 1), (1, 0), (1, 1)], atol=2e-3)
         assert np.allclose([p.z for p in seen], 10 * camera.mphdrr_module.collimator_length, rtol=1e-5)

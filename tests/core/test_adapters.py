@@ -215,7 +215,10 @@ def test_parallelprojs_own_operators_combine_with_it(problem, rng):
     assert sum(one.size for one in stacked(x)) == np.prod(op.out_shape)
 
 
-@pytest.mark.parametrize("make", [mph.scipy_operator, mph.deepinv_physics, mph.pytomography_matrix])
+ADAPTERS = [mph.scipy_operator, mph.deepinv_physics, mph.pytomography_matrix, mph.parallelproj_operator]
+
+
+@pytest.mark.parametrize("make", ADAPTERS[:3])
 def test_a_missing_package_is_named_with_what_installs_it(problem, make, monkeypatch):
     package = make.__name__.partition("_")[0]
 
@@ -234,8 +237,6 @@ def test_in_blender_a_missing_package_refers_to_a_section_that_there_is(monkeypa
     assert f"# {title}\n" in (Path(mph.__file__).parents[1] / page).read_text(encoding="utf-8")
 
 
-@pytest.mark.parametrize(
-    "make", [mph.scipy_operator, mph.deepinv_physics, mph.pytomography_matrix, mph.parallelproj_operator]
-)
+@pytest.mark.parametrize("make", ADAPTERS)
 def test_what_is_no_projector_is_refused(make):
     refused(lambda: make(np.ones((3, 4))), f"{make.__name__}: A: expected a .*(Projector|LinearOperator), got ndarray")

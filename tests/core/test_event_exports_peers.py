@@ -93,11 +93,8 @@ def test_pytorch_3dunet_trains_by_our_configuration_and_keeps_the_activity(unet3
     config = yaml.safe_load((EXAMPLES / "learning/pytorch-3dunet.yml").read_text())
     config["device"] = "cpu"
     config["model"]["f_maps"] = [4, 8]
-    config["trainer"] |= {
-        "checkpoint_dir": str(tmp_path / "training"),
-        "max_num_iterations": 4,
-        "validate_after_iters": 2,
-    }
+    config["trainer"]["checkpoint_dir"] = str(tmp_path / "training")
+    config["trainer"] |= {"max_num_iterations": 4, "validate_after_iters": 2}
     shape = list(event_set[0].truth.array.shape[::-1])
     for name, folder in (("train", "train"), ("val", "test")):
         part = config["loaders"][name]

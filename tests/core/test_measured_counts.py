@@ -213,7 +213,7 @@ GOOD = {"frames": "101-112", "orientation": "back-v", "time": 3.0}
         ({"frames": None}, r"12 frames of 5 x 6 pixels; say which module each frame is of \(--frames"),
         (
             {"orientation": None, "time": None},
-            r"how frames lie .*front\+v.*, and the exposure time in seconds \(--time\)",
+            r"how frames lie .*front\+v.*, and the exposure time in sec.* \(--time\)",
         ),
         ({"frames": "101-111"}, "expected the modules of 12 frames, got 11 numbers"),
         ({"frames": "101-111,101"}, "module 101 has several frames"),

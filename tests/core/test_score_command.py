@@ -135,15 +135,8 @@ def test_the_picture_shows_volume_and_truth(files, tmp_path, command):
 
 def test_a_run_knows_its_phantom_or_its_volume(files, expected, system, tmp_path, command):
     volume, run = str(files / "volume.nii.gz"), tmp_path / "run.h5"
-    phantom = {
-        "kind": "derenzo",
-        "radius": 24.0,
-        "rod_diameters": RODS,
-        "height": 20.0,
-        "activity": 100.0,
-        "voxels": 24,
-    }
-    phantom |= {"position": (1, 2, 3), "euler_degrees": (0, 20, 0)}
+    phantom = {"kind": "derenzo", "radius": 24.0, "rod_diameters": RODS, "height": 20.0, "activity": 100.0}
+    phantom |= {"voxels": 24, "position": (1, 2, 3), "euler_degrees": (0, 20, 0)}
     recipe = mph.Recipe({f"phantom.{name}": value for name, value in phantom.items()} | {"compute.backend": "numpy"})
     (made,) = mph.run_recipe(recipe.updated({"detector.rows": 4, "detector.columns": 4}), system)
     mph.write_run(made, run)

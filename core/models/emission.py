@@ -309,13 +309,13 @@ class Emission(Model):
         """Return the unit of the images of `volume`."""
         return "counts"
 
-    def of_views(self, indices: NDArray[np.integer]) -> Self:
-        """Return the model of the modules with these indices alone."""
+    def of_views(self, which: NDArray[np.integer]) -> Self:
+        """Return the model of the modules `which` alone, indices from 0."""
         arrays = ((f.name, getattr(self, f.name)) for f in fields(self))
-        chosen = {name: array[indices] for name, array in arrays if isinstance(array, np.ndarray)}
-        model = replace(self, system=self.system[indices], **chosen)
+        chosen = {name: array[which] for name, array in arrays if isinstance(array, np.ndarray)}
+        model = replace(self, system=self.system[which], **chosen)
         if self.parts() != (self,):  # the attenuation of lines is computed once, and neighbours stay neighbours
-            model._set("_models", tuple(part.of_views(indices) for part in self.parts()))
+            model._set("_models", tuple(part.of_views(which) for part in self.parts()))
         return model
 
     def check(self, views: Views) -> None:

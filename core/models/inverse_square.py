@@ -39,9 +39,9 @@ class InverseSquareSum(Model):
     def __post_init__(self) -> None:
         instance(self.system, PinholeSystem, "inverse square sum")
 
-    def of_views(self, indices: NDArray[np.integer]) -> Self:
-        """Return the model of the modules with these indices alone."""
-        return replace(self, system=self.system[indices])
+    def of_views(self, which: NDArray[np.integer]) -> Self:
+        """Return the model of the modules `which` alone, indices from 0."""
+        return replace(self, system=self.system[which])
 
     def check(self, views: Views) -> None:
         """Raise `InputError` unless `views` are of this system."""

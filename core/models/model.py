@@ -83,8 +83,8 @@ class Model(ABC):
         """Yield a warning for each attenuation coefficient that looks wrong, such as one in 1/cm."""
         return iter(())
 
-    def of_views(self, indices: NDArray[np.integer]) -> Model:
-        """Return the model of the views with these indices alone."""
+    def of_views(self, which: NDArray[np.integer]) -> Model:
+        """Return the model of the views `which` alone, indices from 0."""
         return self
 
     def parts(self) -> tuple[Model, ...]:

@@ -149,11 +149,11 @@ class ThroughWalls(Model):
         """Efficiencies of `model`."""
         return self.model.efficiency
 
-    def of_views(self, indices: NDArray[np.integer]) -> Self:
-        """Return the model of the modules with these indices alone."""
-        between = tuple(self.between[m] for m in indices)
-        chosen = {"modules": self.modules[indices], "holes": self.holes[indices], "between": between}
-        return replace(self, model=self.model.of_views(indices), **chosen)
+    def of_views(self, which: NDArray[np.integer]) -> Self:
+        """Return the model of the modules `which` alone, indices from 0."""
+        between = tuple(self.between[m] for m in which)
+        chosen = {"modules": self.modules[which], "holes": self.holes[which], "between": between}
+        return replace(self, model=self.model.of_views(which), **chosen)
 
     def check(self, views: Views) -> None:
         """Raise `InputError` unless `views` are of the modules."""

@@ -63,6 +63,11 @@ test = 0.2
 """
 
 
+def with_phantoms(entries: str, text: str = TEXT) -> str:
+    """Return the recipe with other phantoms."""
+    return text[: text.index("[[phantoms]]")] + entries + "\n" + text[text.index("[models.lines]") :]
+
+
 def small_recipe(folder: Path, text: str = TEXT) -> EventRecipe:
     """The recipe in a file of a folder, read."""
     folder.mkdir(parents=True, exist_ok=True)

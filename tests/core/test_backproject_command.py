@@ -81,9 +81,8 @@ def test_the_command_does_what_python_does(run, file, tmp_path, capsys, how):
     )
 
 
-def test_the_usual_voxels_are_those_of_reconstructions(run, file, tmp_path, capsys):
-    assert main(["backproject", file, "--json", "-o", str(tmp_path / "b.npz")]) == 0
-    answer = json.loads(capsys.readouterr().out)
+def test_the_usual_voxels_are_those_of_reconstructions(run, file, tmp_path, command):
+    answer = json.loads(command("backproject", file, "--json", "-o", tmp_path / "b.npz").out)
     volume = mph.read_volume(tmp_path / "b.npz")
     n = volume.grid.shape[0]
     assert answer["voxels"] == [n, n, n] == list(volume.grid.shape) and 64 <= n <= 128

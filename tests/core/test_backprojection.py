@@ -8,7 +8,7 @@ import pytest
 import mphdrr.core as mph
 from mphdrr.core.perspective import places
 
-from .conftest import assert_progress, general_grid, refused
+from .conftest import assert_progress, general_grid, refused, voxel_centers
 
 WAYS = ("sum", "product", "minimum")
 
@@ -60,8 +60,7 @@ def put_together(values: np.ndarray, seen: np.ndarray, how: str) -> np.ndarray:
 def centers(grid: mph.Grid | mph.PerspectiveGrid) -> np.ndarray:
     if isinstance(grid, mph.PerspectiveGrid):
         return grid.centers().reshape(-1, 3)
-    index = np.indices(grid.shape).reshape(3, -1).T
-    return index @ grid.affine[:3, :3].T + grid.affine[:3, 3]
+    return voxel_centers(grid).reshape(-1, 3)
 
 
 def array_of(result: mph.Volume | np.ndarray) -> np.ndarray:

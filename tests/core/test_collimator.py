@@ -14,7 +14,6 @@ import numpy as np
 import pytest
 
 import mphdrr.core as mph
-from mphdrr.core.cli import main
 from mphdrr.core.geometry.checks.plates import needed_angle
 from mphdrr.core.geometry.collimator import Collimator, Construction
 from mphdrr.core.physics.aperture import KnifeEdge
@@ -49,10 +48,8 @@ def from_roi(rng, system, m: int, crossing: np.ndarray) -> Rays:
     points = radius * direction / np.linalg.norm(direction, axis=0) * rng.choice([0.5, 1.0], n)
     turn = rng.uniform(0, 2 * np.pi, n // 2)
     tilt = math.acos(radius / b)  # from the axis, at the sphere's middle, to where rays from the pinhole touch it
-    rim = radius * np.stack(
-        [math.sin(tilt) * np.cos(turn), math.sin(tilt) * np.sin(turn), np.full(n // 2, math.cos(tilt))]
-    )
-    points[:, : n // 2] = rim
+    around = np.stack([np.cos(turn), np.sin(turn)])
+    points[:, : n // 2] = radius * np.concatenate([math.sin(tilt) * around, np.full((1, n // 2), math.cos(tilt))])
     source = points - [[0], [0], [b]]
     hole = np.concatenate([crossing, np.zeros((1, n))])
     return Rays(source, source + (hole - source) * ((l - source[2]) / -source[2]))
@@ -307,17 +304,13 @@ def test_a_plate_that_photons_pass_is_found(scanner):
     assert mph.check_geometry(scanner, aperture_mu=mph.attenuation("tungsten", 140.5)).ok
 
 
-def test_command_names_plates_that_do_not_fit(workbook, tmp_path, capsys):
-    tight = ["--opening-angle", "40", "--plate", "4", "--edge-at", "back"]
-    assert main(["geometry", "check", str(workbook), *tight, "--strict"]) == 1
-    out = capsys.readouterr().out
-    assert "a plate of 4 mm is too thick for an opening angle of 40 degrees" in out and "47.4 are needed" in out
-    lead = ["--aperture-mu", "lead", "--isotope", "I-131"]
-    assert main(["geometry", "check", str(workbook), *lead, "--json"]) == 0
-    geometry = json.loads(capsys.readouterr().out)["geometry"]
+def test_command_names_plates_that_do_not_fit(workbook, tmp_path, command):
+    check = ["geometry", "check", workbook]
+    said = command(*check, "--opening-angle", 40, "--plate", 4, "--edge-at", "back", "--strict", status=1).out
+    assert "a plate of 4 mm is too thick for an opening angle of 40 degrees" in said and "47.4 are needed" in said
+    geometry = json.loads(command(*check, "--aperture-mu", "lead", "--isotope", "I-131", "--json").out)["geometry"]
     assert len(geometry["thin_plates"]) == 80 and geometry["vignetted"] == []
-    assert main(["geometry", "check", str(workbook), "--isotope", "I-131"]) == 1
-    assert "--isotope needs --aperture-mu" in capsys.readouterr().err
+    assert "--isotope needs --aperture-mu" in command(*check, "--isotope", "I-131", status=1).err
     options = ["--format", "stl-parts", "--modules", "3", "--set", "edge_at=front", "--set", "opening_degrees=60"]
-    assert main(["geometry", "export", str(workbook), "-o", str(tmp_path / "stl"), *options]) == 0
+    command("geometry", "export", workbook, "-o", tmp_path / "stl", *options)
     assert len(list((tmp_path / "stl").iterdir())) == 2

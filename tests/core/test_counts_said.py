@@ -66,12 +66,9 @@ def test_pixels_are_compared_along_rows_and_columns_however_frames_lie(system, r
         assert (found == []) == is_right, found
         if not is_right:
             assert f"pixels of {along:g} x {down:g} mm; taken as 3 x 4.8 mm" in found[0]
-    virtual = warned(
-        lambda: mph.counts_run(
-            mph.read_counts(path), system, "101-112", word, 60.0, detector="virtual", magnification=7
-        )
-    )
-    assert "pixels of 3 x 3 mm; taken as 3 x 4.8 mm" in virtual[0], "on the crystal, wherever the images are taken"
+    virtual = {"detector": "virtual", "magnification": 7}
+    said = warned(lambda: mph.counts_run(mph.read_counts(path), system, "101-112", word, 60.0, **virtual))
+    assert "pixels of 3 x 3 mm; taken as 3 x 4.8 mm" in said[0], "on the crystal, wherever the images are taken"
 
 
 def test_several_exposures_are_those_of_the_frames_that_are_used(system, rng, tmp_path):
@@ -81,17 +78,14 @@ def test_several_exposures_are_those_of_the_frames_that_are_used(system, rng, tm
     parts = [Dataset(), Dataset()]
     parts[0].ActualFrameDuration, parts[1].ActualFrameDuration = 20_000, 35_000
     path, vector = tmp_path / "d.dcm", [1] * 12 + [2] * 12
-    dicom_files.write_frames(
-        counted(rng, (24, 6, 6)), path, RotationInformationSequence=parts, RotationVector=vector, NumberOfRotations=2
-    )
+    rotations = {"RotationInformationSequence": parts, "RotationVector": vector, "NumberOfRotations": 2}
+    dicom_files.write_frames(counted(rng, (24, 6, 6)), path, **rotations)
     mixed = "101-106, none*6, none*6, 107-112"
-    with pytest.raises(
-        mph.InputError, match=r"frame 19 \(module 107\): the file says 35 s, the time .* is 20 s, .* 5 frames more"
-    ):
-        both_ways(system, path, mixed, "back-v", 20.0)
+    words = r"frame 19 \(module 107\): the file says 35 s, the time .* is 20 s, .* 5 frames more"
+    refused(lambda: both_ways(system, path, mixed, "back-v", 20.0), words)
     assert both_ways(system, path, "101-112, none*12", "back-v", 20.0) == []
-    with pytest.raises(mph.InputError, match=r"frame 13 \(module 101\): the file says 35 s"):
-        both_ways(system, path, "none*12, 101-112", "back-v", 20.0)
+    words = "frame 13 (module 101): the file says 35 s"
+    refused(lambda: both_ways(system, path, "none*12, 101-112", "back-v", 20.0), words)
     counts = mph.read_counts(path)
     assert mph.counts_run(counts, system, mixed, "back-v").recipe["model.time"] == (20.0,) * 6 + (35.0,) * 6
     assert both_ways(system, path, mixed, "back-v", [20.0] * 6 + [35.0] * 6) == []
@@ -108,8 +102,8 @@ def test_exposures_of_an_interfile_are_those_of_its_images(system, rng, tmp_path
         seconds = 600 if number < 7 else 150
         header = header.replace("!time per projection (sec) := 600", f"!image duration (sec) := {seconds}", 1)
     path.write_text(header)
-    with pytest.raises(mph.InputError, match=r"frame 8 \(module 108\): the file says 150 s, .* 4 frames more"):
-        both_ways(system, path, "101-112", "back-v", 600.0)
+    words = r"frame 8 \(module 108\): the file says 150 s, .* 4 frames more"
+    refused(lambda: both_ways(system, path, "101-112", "back-v", 600.0), words)
     run = mph.counts_run(mph.read_counts(path), system, "101-112", "back-v")
     assert run.recipe["model.time"] == (600.0,) * 7 + (150.0,) * 5
     both_of_150 = "none*7, 101, 102, none*3"
@@ -125,17 +119,16 @@ def test_several_files_say_each_its_own(system, rng, tmp_path):
         paths.append(tmp_path / f"{number}.hdr")
         write_hdr(counted(rng, (4, 6, 6)), paths[-1])
         paths[-1].write_text(paths[-1].read_text().replace(":= 600", f":= {time}"))
-    with pytest.raises(mph.InputError, match=r"1.hdr, 2.hdr, 3.hdr: frame 9 \(module 109\): the file says 55 s"):
-        both_ways(system, paths, "101-112", "back-v", 40.0)
+    words = "1.hdr, 2.hdr, 3.hdr: frame 9 (module 109): the file says 55 s"
+    refused(lambda: both_ways(system, paths, "101-112", "back-v", 40.0), words)
     assert both_ways(system[:8], paths, "101-108, none*4", "back-v", 40.0) == []
 
 
 def test_frames_of_several_energy_windows_are_not_taken_together_in_silence(system, rng, tmp_path):
     pytest.importorskip("pydicom")
     path = tmp_path / "w.dcm"
-    dicom_files.write_frames(
-        counted(rng, (24, 6, 6)), path, 60_000, NumberOfEnergyWindows=2, EnergyWindowVector=[1, 2] * 12
-    )
+    windows = {"NumberOfEnergyWindows": 2, "EnergyWindowVector": [1, 2] * 12}
+    dicom_files.write_frames(counted(rng, (24, 6, 6)), path, 60_000, **windows)
     one = ", ".join(f"{number}, none" for number in range(101, 113))
     assert both_ways(system, path, one, "back-v", 60.0) == []
     (text,) = both_ways(system, path, "101-112, none*12", "back-v", 60.0)
@@ -151,21 +144,14 @@ def test_counts_are_an_array_like_any_other(rng, tmp_path):
     assert counts.dtype == np.uint16 and isinstance(counts, np.ndarray)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        for found, expected in (
-            (counts + counts, frames + frames),
-            (counts.sum(), frames.sum()),
-            (counts.mean(axis=0), frames.mean(axis=0)),
-            (np.sqrt(counts), np.sqrt(frames)),
-            (np.concatenate([counts, counts]), np.concatenate([frames, frames])),
-            (counts[counts > 9], frames[frames > 9]),
-            (counts[..., ::-1], frames[..., ::-1]),
-            (counts[None, 0], frames[None, 0]),
-            (counts[()], frames),
-            (counts.reshape(5, 12)[2], frames.reshape(5, 12)[2]),
-            (counts[2, 1, 1], frames[2, 1, 1]),
-            (pickle.loads(pickle.dumps(counts)), frames),
-        ):
-            np.testing.assert_array_equal(found, expected)
+        for use in (
+            lambda array: array + array, np.sum, lambda array: array.mean(axis=0), np.sqrt,
+            lambda array: np.concatenate([array, array]), lambda array: array[array > 9],
+            lambda array: array[..., ::-1], lambda array: array[None, 0], lambda array: array[()],
+            lambda array: array.reshape(5, 12)[2], lambda array: array[2, 1, 1],
+            lambda array: pickle.loads(pickle.dumps(array)),
+        ):  # fmt: skip
+            np.testing.assert_array_equal(use(counts), use(frames))
     assert type(counts + 1) is type(counts.mean(axis=0)) is np.ndarray
 
 

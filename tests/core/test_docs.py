@@ -31,7 +31,6 @@ SMALLER = (
     (r"centered\(256, 0\.4\)|centered\(128, [12]\.[05]\)", "centered(24, 4.0)"),  # voxels
     (r"centered\(256, 3\.0\)", "centered(24, 20.0)"),
     (r"centered\(64, (\d\.\d)\)|centered\(\(64, 64, 64\), 1\.5\)", "centered(16, 6.0)"),
-    (r"(?<=centered\(32, )4\.0", "4.0"),
     (r"--voxels (256|64) --spacing \S+", "--voxels 16 --spacing 6"),
     (r"--voxels 44 32 56 --spacing 8", "--voxels 11 8 14 --spacing 32"),
     (r"--size (64 64|128 128|96 128)", "--size 16 16"),

@@ -32,116 +32,69 @@ def folder(made, tmp_path) -> Path:
     return Path(shutil.copytree(made / "set", tmp_path / "set"))
 
 
-def cut(folder: Path, others: Path) -> Path:
-    path = folder / "events" / "000001.h5"
-    path.write_bytes(path.read_bytes()[:-7])
-    return path
+def flip_a_bit(data: bytes) -> bytes:
+    """Return the bytes with another bit in the middle."""
+    middle = len(data) // 2
+    return data[:middle] + bytes([data[middle] ^ 1]) + data[middle + 1 :]
 
 
-def other_recipe(folder: Path, others: Path) -> Path:
-    return Path(shutil.copy(others / "foreign" / "events" / "000002.h5", folder / "events" / "000002.h5"))
-
-
-def changed_byte(folder: Path, others: Path) -> Path:
-    path = folder / "events" / "000003.h5"
-    data = bytearray(path.read_bytes())
-    data[len(data) // 2] ^= 1
-    path.write_bytes(data)
-    return path
-
-
-def missing(folder: Path, others: Path) -> Path:
-    path = folder / "events" / "000004.h5"
-    path.unlink()
-    return path
-
-
-def renamed(folder: Path, others: Path) -> Path:
-    return Path(shutil.copy(folder / "events" / "000000.h5", folder / "events" / "000001.h5"))
-
-
-def header_byte(folder: Path, others: Path) -> Path:
-    path = folder / "events" / "000002.h5"
-    data = bytearray(path.read_bytes())
-    data[500] = 1
-    path.write_bytes(data)
-    return path
-
-
-def foreign(folder: Path, others: Path) -> Path:
-    (folder / "events" / "notes.txt").write_text("mine")
-    return folder / "events" / "notes.txt"
-
-
-def leftover(folder: Path, others: Path) -> Path:
-    (folder / "events" / ".0123abcd-000001.h5").write_bytes(b"half")
-    return folder / "events" / ".0123abcd-000001.h5"
-
-
-def index(folder: Path, others: Path) -> Path:
-    path = folder / "index.csv"
-    path.write_text(path.read_text().replace("train", "test"))
-    return path
-
-
-def index_saved_elsewhere(folder: Path, others: Path) -> Path:
-    path = folder / "index.csv"
-    path.write_bytes(path.read_bytes().replace(b"\n", b"\r\n"))
-    return path
-
-
-def index_cut_between_rows(folder: Path, others: Path) -> Path:
-    path = folder / "index.csv"
-    path.write_bytes(b"".join(path.read_bytes().splitlines(keepends=True)[:4]))
-    return path
-
-
-def index_of_no_text(folder: Path, others: Path) -> Path:
-    path = folder / "index.csv"
-    path.write_bytes(path.read_bytes() + b"\xff\xfe")
-    return path
-
-
-def foreign_event(folder: Path, others: Path) -> Path:
-    return Path(shutil.copy(others / "foreign" / "events" / "000002.h5", folder / "events" / "000077.h5"))
-
-
-def folder_for_event(folder: Path, others: Path) -> Path:
-    path = missing(folder, others)
-    path.mkdir()
-    return path
-
-
+FOREIGN_EVENT, FIRST_EVENT = "foreign/events/000002.h5", "set/events/000000.h5"
 DAMAGE = {
-    cut: "cut: ", other_recipe: "of another recipe", changed_byte: "changed: its bytes", missing: "missing",
-    renamed: "is event 0", header_byte: "changed: its first", foreign: "does not belong to this set",
-    leftover: "interrupted", index: "changed: its rows differ from those that recipe.toml gives",
-    index_saved_elsewhere: "changed: ", index_cut_between_rows: "changed: ", index_of_no_text: "changed: ",
-    foreign_event: "not in the index", folder_for_event: "",
+    "cut": ("events/000001.h5", lambda data: data[:-7], "cut: "),
+    "of another recipe": ("events/000002.h5", FOREIGN_EVENT, "of another recipe"),
+    "a changed byte": ("events/000003.h5", flip_a_bit, "changed: its bytes"),
+    "missing": ("events/000004.h5", None, "missing"),
+    "renamed": ("events/000001.h5", FIRST_EVENT, "is event 0"),
+    "a changed header": ("events/000002.h5", lambda data: data[:500] + b"\1" + data[501:], "changed: its first"),
+    "a foreign file": ("events/notes.txt", lambda _: b"mine", "does not belong to this set"),
+    "a leftover": ("events/.0123abcd-000001.h5", lambda _: b"half", "interrupted"),
+    "a changed index": ("index.csv", lambda data: data.replace(b"train", b"test"), "changed: its rows differ from"),
+    "an index saved elsewhere": ("index.csv", lambda data: data.replace(b"\n", b"\r\n"), "changed: "),
+    "an index cut between rows": ("index.csv", lambda data: b"".join(data.splitlines(keepends=True)[:4]), "changed: "),
+    "an index of no text": ("index.csv", lambda data: data + b"\xff\xfe", "changed: "),
+    "a foreign event": ("events/000077.h5", FOREIGN_EVENT, "not in the index"),
+    "a folder for an event": ("events/000004.h5", Path.mkdir, ""),
 }  # fmt: skip
+"""A file, what becomes of its bytes or which file takes its place, and what is said of it."""
+MOVED = ("a foreign file", "a foreign event", "a folder for an event")
 
 
-@pytest.mark.parametrize("damage", DAMAGE, ids=lambda damage: damage.__name__)
+def damaged(folder: Path, sets: Path, name: str) -> Path:
+    """Damage a set in one of these ways, and return the path that is at fault."""
+    path, change = folder / DAMAGE[name][0], DAMAGE[name][1]
+    if isinstance(change, str):
+        shutil.copy(sets / change, path)
+    elif change in (None, Path.mkdir):
+        path.unlink()
+        if change is not None:
+            change(path)
+    else:
+        path.write_bytes(change(path.read_bytes() if path.exists() else b""))
+    return path
+
+
+@pytest.mark.parametrize("damage", DAMAGE)
 def test_damage_is_found_and_mended_and_nothing_else_is_touched(tmp_path, made, folder, damage, command):
     before = tree(folder)
     assert "5 events, every byte as it was written" in command("events", "check", folder).out
-    path = damage(folder, made)
+    path = damaged(folder, made, damage)
     times = {file: file.stat().st_mtime_ns for file in folder.rglob("*") if file.is_file() and file != path}
     said = command("events", "check", folder, status=1)
     (line,) = said.out.splitlines()
-    assert line.startswith(str(path)) and DAMAGE[damage] in line
+    assert line.startswith(str(path)) and DAMAGE[damage][2] in line
     assert "1 fault; --repair mends" in said.err
     command("events", "check", folder, "--repair")
     assert tree(folder) == before
     assert {file: file.stat().st_mtime_ns for file in times} == times
     moved = [file.name for file in (tmp_path / "set-foreign").glob("*")]
-    assert moved == ([path.name] if damage in (foreign, foreign_event, folder_for_event) else [])
+    assert moved == ([path.name] if damage in MOVED else [])
     command("events", "check", folder)
 
 
 def test_all_damage_at_once(made, folder, command):
     before = tree(folder)
-    paths = {str(damage(folder, made)) for damage in (cut, other_recipe, changed_byte, missing, foreign)}
+    names = ("cut", "of another recipe", "a changed byte", "missing", "a foreign file")
+    paths = {str(damaged(folder, made, name)) for name in names}
     assert {str(fault.path) for fault in events.check(folder)} == paths
     assert {fault["path"] for fault in json.loads(command("events", "check", folder, "--json", status=1).out)} == paths
     assert "4 events made anew" in command("events", "check", folder, "--repair", "--workers", "2").out
@@ -179,8 +132,8 @@ def test_what_the_recipe_names_may_lie_in_the_folder(tmp_path, command):
 
 
 def test_status(tmp_path, made, folder, command):
-    missing(folder, made)
-    cut(folder, made)
+    for name in ("missing", "cut"):
+        damaged(folder, made, name)
     said = command("events", "status", folder).out
     assert "3 of 5 events" in said and "missing: 1, 4; mphdrr events make" in said
     found = json.loads(command("events", "status", folder, "--json").out)

@@ -7,14 +7,13 @@ import os
 import subprocess
 import sys
 import time
-from pathlib import Path
 
 import pytest
 
 from mphdrr.core import events
 
 from .small_events import small_recipe
-from .test_event_work import tree
+from .test_event_work import begin, tree
 
 AS_SHIPPED = True  # other processes make the same
 
@@ -78,12 +77,6 @@ def wanted(tmp_path) -> dict[str, bytes]:
     return tree(tmp_path / "alone")
 
 
-def make(folder: Path, *options: str, **more) -> subprocess.Popen[str]:
-    command = [sys.executable, "-m", "mphdrr", "events", "make", str(folder / "set"), "--quiet"]
-    command += ["--recipe", str(folder / "small.toml"), "-n", str(COUNT), *options]
-    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, **more)
-
-
 def wait_for(done, seconds: float = 600) -> None:
     end = time.monotonic() + seconds
     while not done():
@@ -103,7 +96,7 @@ def test_a_scheduler_makes_the_same_bytes_though_one_of_its_workers_dies(tmp_pat
         worker = ["distributed.cli.dask_worker", "--nthreads", "1", "--no-dashboard", "--no-nanny"]
         begun += [subprocess.Popen([*python, *worker, "--scheduler-file", str(address)], **quiet) for _ in range(2)]
 
-        work = make(tmp_path, "--dask", json.loads(address.read_text())["address"])
+        work = begin(tmp_path, "-n", str(COUNT), "--quiet", "--dask", json.loads(address.read_text())["address"])
         wait_for(lambda: list(tmp_path.glob("set/events/*.h5")))
         begun[1].kill()
         assert work.wait(600) == 0, work.communicate()
@@ -124,12 +117,13 @@ def test_a_lost_disk_ends_in_one_line_and_the_set_resumes(tmp_path, wanted, work
     subprocess.run([*compiler, "-o", str(library), str(tmp_path / "lost.c")], check=True)
 
     shim = {"LD_PRELOAD": str(library), "LOST_FOLDER": str(tmp_path / "set"), "LOST_WHEN": str(marker)}
-    work = make(tmp_path, "--workers", workers, env=os.environ | shim)
+    make = (tmp_path, "-n", str(COUNT), "--quiet", "--workers", workers)
+    work = begin(*make, env=os.environ | shim)
     wait_for(lambda: len(list(tmp_path.glob("set/events/0*.h5"))) >= 2)
     marker.touch()
     _, said = work.communicate(timeout=600)
     assert work.returncode == 1
     assert len(said.splitlines()) == 1 and said.startswith("mphdrr: ") and "Input/output error" in said, said
     marker.unlink()
-    assert make(tmp_path, "--workers", workers).wait(600) == 0
+    assert begin(*make).wait(600) == 0
     assert tree(tmp_path / "set") == wanted

@@ -14,22 +14,17 @@ import numpy as np
 import pytest
 
 import mphdrr.core as mph
-from mphdrr.core.cli import main
-from mphdrr.core.errors import InputError
 from mphdrr.core.events.exports import PROGRAMS, export_events
 from mphdrr.core.events.exports.slots import read_slots, row_slots
 
 from .conftest import refused
 from .small_events import TEXT, small_recipe
+from .test_event_work import tree
 
 
 def rows_of(folder: Path, name: str) -> list[dict[str, str]]:
     with open(folder / name, newline="") as file:
         return list(csv.DictReader(file))
-
-
-def contents(folder: Path) -> dict[str, bytes]:
-    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
 def test_slots_of_the_users_scanner_are_96_of_which_columns_20_to_23_mirror_the_last_four(scanner):
@@ -100,6 +95,9 @@ def test_numbers_of_files_are_the_exports_own(event_set, tmp_path):
     assert [(row["i"], row["event"], row["split"]) for row in rows] == [
         (str(i), str(event.number), "test") for i, event in enumerate(part)
     ]
+    export_events(event_set[:2] + event_set[1:3], tmp_path / "joined", "npz")  # one event twice
+    assert [row["event"] for row in rows_of(tmp_path / "joined", "events.csv")] == ["0", "1", "1", "2"]
+    assert len(list((tmp_path / "joined").glob("*.npz"))) == 4
 
 
 def test_3dunet_pairs_slots_with_radon_images_of_one_shape(event_set, tmp_path):
@@ -127,12 +125,11 @@ def test_3dunet_pairs_back_projections_with_the_truth_as_z_y_x(event_set, tmp_pa
 
 def test_a_level_does_not_change_the_scale_of_back_projections(event_set, tmp_path):
     """Line integrals are per time: a share of the time makes them noisier, not smaller."""
+    sums = []
     for level in (1.0, 0.5):
         folder = tmp_path / str(level)
         export_events(event_set[:1], folder, "3dunet", models="counts", noise=1, level=level, raw="backprojection")
-    sums = []
-    for level in (1.0, 0.5):
-        (path,) = (tmp_path / str(level)).glob("*/000000.h5")
+        (path,) = folder.glob("*/000000.h5")
         with h5py.File(path) as file:
             sums.append(file["raw"][()].sum(dtype=float))
     counts = event_set[0].images("counts").sum(dtype=float)
@@ -140,11 +137,12 @@ def test_a_level_does_not_change_the_scale_of_back_projections(event_set, tmp_pa
 
 
 def test_3dunet_says_what_does_not_fit(event_set, tmp_path):
-    with pytest.raises(InputError, match="takes the images of one model: choose one of counts, rays"):
-        export_events(event_set, tmp_path, "3dunet")
+    one_model = "takes the images of one model: choose one of counts, rays"
+    refused(lambda: export_events(event_set, tmp_path, "3dunet"), one_model)
     (tmp_path / "few.csv").write_text("slot,module,mirrored\n0,1,0\n")
-    with pytest.raises(InputError, match=r"1 slots need Radon images of as many angles .* has 16, 6"):
-        export_events(event_set, tmp_path / "out", "3dunet", models="rays", slots=tmp_path / "few.csv")
+    options = {"models": "rays", "slots": tmp_path / "few.csv"}
+    slots = "1 slots need Radon images of as many angles .* has 16, 6"
+    refused(lambda: export_events(event_set, tmp_path / "out", "3dunet", **options), slots)
 
 
 def read_shards(folder: Path) -> dict[str, dict[str, object]]:
@@ -182,11 +180,9 @@ def test_webdataset_has_an_event_a_key_in_shards_of_a_split(event_set, tmp_path)
     assert len(seeds) == 5, "events of one seed have noise each of its own"
 
 
-def test_compressed_shards_take_little_more_than_the_set_and_uncompressed_ones_hold_the_same(event_set, tmp_path):
-    export_events(event_set, tmp_path / "packed", "webdataset")
-    export_events(event_set, tmp_path / "plain", "webdataset", uncompressed=True)
-    sizes = [sum(path.stat().st_size for path in (tmp_path / name).glob("*.tar")) for name in ("packed", "plain")]
-    assert sizes[0] < 0.5 * sizes[1]
+def test_uncompressed_shards_hold_the_same_as_compressed_ones(event_set, tmp_path):
+    for name in ("packed", "plain"):
+        export_events(event_set, tmp_path / name, "webdataset", uncompressed=name == "plain")
     plain = read_shards(tmp_path / "plain")
     for name, sample in read_shards(tmp_path / "packed").items():
         for ending, value in sample.items():
@@ -235,11 +231,11 @@ def test_exports_that_stopped_go_on_and_more_events_are_added_and_the_bytes_are_
     there = {path: path.stat().st_ino for path in (tmp_path / "parts").rglob("*.*") if "0" in path.stem}
     assert there
     export_events(event_set, tmp_path / "parts", program, **options)
-    assert contents(tmp_path / "parts") == contents(tmp_path / "whole")
+    assert tree(tmp_path / "parts") == tree(tmp_path / "whole")
     assert {path: path.stat().st_ino for path in there} == there, "what was there is kept"
     export_events(event_set[:3], tmp_path / "grown", program, **options)
     export_events(event_set, tmp_path / "grown", program, **options)
-    assert contents(tmp_path / "grown") == contents(tmp_path / "whole")
+    assert tree(tmp_path / "grown") == tree(tmp_path / "whole")
 
 
 def test_what_a_killed_export_was_writing_is_removed(event_set, tmp_path):
@@ -248,11 +244,11 @@ def test_what_a_killed_export_was_writing_is_removed(event_set, tmp_path):
     out.mkdir()
     (out / ".0a1b2c3d-export.json").write_text("{")
     export_events(event_set, out, "3dunet", models="rays")
-    whole = contents(out)
+    whole = tree(out)
     (out / "train" / ".0a1b2c3d-000000.h5").write_bytes(b"half")
     (out / ".0a1b2c3d-events.csv").write_text("i")
     export_events(event_set, out, "3dunet", models="rays")
-    assert contents(out) == whole
+    assert tree(out) == whole
 
 
 def test_another_table_of_slots_is_another_export(event_set, tmp_path):
@@ -261,17 +257,17 @@ def test_another_table_of_slots_is_another_export(event_set, tmp_path):
     export_events(event_set, tmp_path / "out", "3dunet", models="rays")
     export_events(event_set, tmp_path / "out", "3dunet", models="rays", slots=slots, raw="slots")
     slots.write_text(slots.read_text().replace(",1\n", ",0\n"))
-    with pytest.raises(InputError, match="differs in options"):
-        export_events(event_set, tmp_path / "out", "3dunet", models="rays", slots=slots)
+    again = {"models": "rays", "slots": slots}
+    refused(lambda: export_events(event_set, tmp_path / "out", "3dunet", **again), "differs in options")
 
 
 def test_folders_that_hold_something_else_are_refused(event_set, tmp_path):
     export_events(event_set, tmp_path / "out", "npz", models="rays")
-    before = contents(tmp_path / "out")
+    before = tree(tmp_path / "out")
     refused(lambda: export_events(event_set, tmp_path / "out", "npz"), "differs in models")
     refused(lambda: export_events(event_set, tmp_path / "out", "webdataset", models="rays"), "differs in program")
     refused(lambda: export_events(event_set[1:], tmp_path / "out", "npz", models="rays"), "other events")
-    assert contents(tmp_path / "out") == before
+    assert tree(tmp_path / "out") == before
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "notes.txt").write_text("mine")
     refused(lambda: export_events(event_set, tmp_path / "full", "npz"), "expected a new or empty folder")
@@ -292,35 +288,24 @@ def test_what_cannot_be_exported_is_said(options, found, event_set, tmp_path):
     assert not (tmp_path / "out").exists()
 
 
-def test_events_of_joined_sets_are_told_apart(event_set, tmp_path):
-    export_events(event_set[:2] + event_set[1:3], tmp_path / "out", "npz")
-    assert [row["event"] for row in rows_of(tmp_path / "out", "events.csv")] == ["0", "1", "1", "2"]
-    assert len(list((tmp_path / "out").glob("*.npz"))) == 4
-
-
-def test_command_says_the_size_first_and_writes(event_set, tmp_path, capsys):
-    folder = str(event_set[0].path.parents[1])
-    arguments = ["events", "export", folder, "--to", "webdataset", "--split", "train", "--model", "counts"]
-    out = str(tmp_path / "out")
-    assert main([*arguments, "--noise", "own", "--level", "0.25", "--events-per-shard", "2", "-o", out]) == 0
-    printed = capsys.readouterr()
+def test_command_says_the_size_first_and_writes(event_set, tmp_path, command):
+    words = ["events", "export", event_set[0].path.parents[1], "--to", "webdataset", "--split", "train"]
+    words += ["--model", "counts", "-o", tmp_path / "out"]
+    printed = command(*words, "--noise", "own", "--level", 0.25, "--events-per-shard", 2)
     train = event_set.split("train")
-    each = 4 * (10 * 9 * 8 + 8 * 12 * 12 + 22 * 12 * 12)
-    assert printed.err.startswith(f"mphdrr: {len(train)} events of at most {each / 2**10:.0f} KiB, ")
+    size = 4 * (10 * 9 * 8 + 8 * 12 * 12 + 22 * 12 * 12)
+    assert printed.err.startswith(f"mphdrr: {len(train)} events of at most {size / 2**10:.0f} KiB, ")
     samples = read_shards(tmp_path / "out")
     assert len(samples) == len(train)
     assert all(sample["json"]["level"] == 0.25 for sample in samples.values())
-    assert main([*arguments, "--noise", "loud", "-o", out]) == 2
-    assert "expected own, or a seed" in capsys.readouterr().err
+    assert "expected own, or a seed" in command(*words, "--noise", "loud", status=2).err
 
 
-def test_make_new_and_export_say_what_they_did_as_json(tmp_path, capsys):
+def test_make_new_and_export_say_what_they_did_as_json(tmp_path, command):
     recipe, folder = tmp_path / "small.toml", str(tmp_path / "set")
 
     def said(*words: str) -> dict[str, object]:
-        capsys.readouterr()
-        assert main(["events", *words, "--json"]) == 0
-        return json.loads(capsys.readouterr().out)  # nothing else is on standard output
+        return json.loads(command("events", *words, "--json").out)  # nothing else is on standard output
 
     new = said("new", "-o", str(recipe))
     assert new == {"file": str(recipe), "recipe": recipe.read_text(encoding="utf-8")}

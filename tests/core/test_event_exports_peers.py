@@ -37,14 +37,18 @@ def phase(folder, patch) -> dict:
     return {"file_paths": [str(folder)], "slice_builder": slices, "transformer": {"raw": to_tensor, "label": to_tensor}}
 
 
+def train_loaders(unet3d, folder, shape, **options) -> dict:
+    """Return the loaders of an exported folder for training and validation, as pytorch-3dunet makes them."""
+    phases = {"train": phase(folder / "train", shape), "val": phase(folder / "test", shape)}
+    return unet3d.get_train_loaders({"loaders": {"num_workers": 0} | options | phases, "device": "cpu"})
+
+
 @pytest.mark.parametrize("dataset", ["StandardHDF5Dataset", "LazyHDF5Dataset"])
 @pytest.mark.parametrize("raw", ["slots", "backprojection"])
 def test_pytorch_3dunet_loads_raw_and_label(unet3d, dataset, raw, event_set, tmp_path):
     export_events(event_set, tmp_path, "3dunet", models="counts", noise="own", raw=raw)
     shape = (16, 12, 12) if raw == "slots" else event_set[0].truth.array.shape[::-1]
-    loaders = {"dataset": dataset, "num_workers": 0, "batch_size": 1}
-    loaders |= {"train": phase(tmp_path / "train", shape), "val": phase(tmp_path / "test", shape)}
-    made = unet3d.get_train_loaders({"loaders": loaders, "device": "cpu"})
+    made = train_loaders(unet3d, tmp_path, shape, dataset=dataset, batch_size=1)
     labels = {}
     for name, split in (("train", "train"), ("val", "test")):
         events = event_set.split(split)
@@ -63,6 +67,23 @@ def test_pytorch_3dunet_loads_raw_and_label(unet3d, dataset, raw, event_set, tmp
     assert not labels
 
 
+def test_pytorch_3dunets_network_learns_from_slots(unet3d, event_set, tmp_path):
+    from pytorch3dunet.unet3d.model import UNet3D
+
+    export_events(event_set, tmp_path, "3dunet", models="counts")
+    image, label = next(iter(train_loaders(unet3d, tmp_path, (16, 12, 12), batch_size=2)["train"]))
+    torch.manual_seed(1)
+    network = UNet3D(1, 1, final_sigmoid=False, f_maps=4, num_levels=2, num_groups=2, is_segmentation=False)
+    optimizer, losses = torch.optim.Adam(network.parameters(), 0.05), []
+    for _ in range(6):
+        loss = torch.nn.functional.mse_loss(network(image / image.max()), label / label.max())
+        losses.append(loss.item())
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+    assert losses[-1] < losses[0]
+
+
 def test_pytorch_3dunet_trains_by_our_configuration_and_keeps_the_activity(unet3d, event_set, tmp_path):
     """With its own trainer: `examples/learning/pytorch-3dunet.yml` but for sizes and folders."""
     import yaml
@@ -72,11 +93,8 @@ def test_pytorch_3dunet_trains_by_our_configuration_and_keeps_the_activity(unet3
     config = yaml.safe_load((EXAMPLES / "learning/pytorch-3dunet.yml").read_text())
     config["device"] = "cpu"
     config["model"]["f_maps"] = [4, 8]
-    config["trainer"] |= {
-        "checkpoint_dir": str(tmp_path / "training"),
-        "max_num_iterations": 4,
-        "validate_after_iters": 2,
-    }
+    config["trainer"]["checkpoint_dir"] = str(tmp_path / "training")
+    config["trainer"] |= {"max_num_iterations": 4, "validate_after_iters": 2}
     shape = list(event_set[0].truth.array.shape[::-1])
     for name, folder in (("train", "train"), ("val", "test")):
         part = config["loaders"][name]

@@ -32,12 +32,13 @@ def small(tmp_path_factory) -> events.EventSet:
 def stored(event: events.Event) -> dict[str, np.ndarray]:
     """All datasets of a file by name, read by h5py alone, with their scales."""
     found = {}
+
+    def keep(name: str, item: h5py.Dataset | h5py.Group) -> None:
+        if isinstance(item, h5py.Dataset):
+            found[name] = item[()] * item.attrs.get("scale", 1)
+
     with h5py.File(event.path, "r") as file:
-        file.visititems(
-            lambda name, item: (
-                found.update({name: item[()] * item.attrs.get("scale", 1)}) if isinstance(item, h5py.Dataset) else None
-            )
-        )
+        file.visititems(keep)
     return found
 
 
@@ -57,11 +58,8 @@ def test_the_images_are_of_the_truth_in_the_file(small):
             np.testing.assert_allclose((x / w, y / w), (column, row), atol=1e-9)
         # seen along an axis, a parallel projection is the sum of the voxels: columns along -y, then along +x; rows along +z
         along_x, along_y = 6.0 * truth.sum(axis=0)[::-1].T, 6.0 * truth.sum(axis=1).T
-        for image, sums in (
-            (found["radon/6"][0], along_x),
-            (found["radon/8"][0], along_x),
-            (found["radon/8"][4], along_y),
-        ):
+        radon = found["radon/6"], found["radon/8"]
+        for image, sums in ((radon[0][0], along_x), (radon[1][0], along_x), (radon[1][4], along_y)):
             np.testing.assert_allclose(image, sums, rtol=1e-5, atol=1e-5 * sums.max())
 
 
@@ -90,9 +88,8 @@ def test_a_sparse_truth_errs_by_no_more_than_it_says(small, tmp_path, below):
         expected = np.where(np.abs(whole) > below * whole.max(), whole, 0)
         np.testing.assert_array_equal(part, expected)
         with h5py.File(kept.path, "r") as file:
-            attributes, index, values = (
-                dict(file["truth_values"].attrs), file["truth_index"][()], file["truth_values"][()]
-            )  # fmt: skip
+            attributes = dict(file["truth_values"].attrs)
+            index, values = file["truth_index"][()], file["truth_values"][()]
         assert attributes["error"] == np.abs(whole - expected).max()
         by_hand = np.zeros(np.prod(attributes["shape"]), np.float32)
         by_hand[index] = values
@@ -120,10 +117,8 @@ def test_every_changed_byte_is_noticed(small, tmp_path):
 
 
 def test_bytes_do_not_depend_on_threads_or_on_what_was_made_before(small):
-    recipe = small.recipe
-    system = small.system
-    matrices = small[0].views.projection_matrices()
-    geometry = {"projection_matrix": (matrices, "pixel"), "number": (system.numbers, "1")}
+    recipe, matrices = small.recipe, small[0].views.projection_matrices()
+    geometry = {"projection_matrix": (matrices, "pixel"), "number": (small.system.numbers, "1")}
     for threads in (1, 3):
         maker = events.EventMaker(recipe, threads)
         for number in (1, 0, 1):

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 import mphdrr.core as mph
-from mphdrr.core.cli import main
 from mphdrr.core.events.templates import TEMPLATES, template_text
 
 from .conftest import WORKBOOK
@@ -41,6 +40,8 @@ def test_the_derenzo_template_is_the_users_event():
     assert list(recipe.models) == ["emission"] and recipe.models["emission"]["model.hole"] == "auto"
     maker = mph.events.EventMaker(recipe)
     assert (len(maker.system), maker.views.shape) == (80, (256, 256))
+    escaped = mph.events.EventRecipe(template_text("derenzo", 'a "b"\\c.xlsx'))  # what TOML escapes, in a path
+    assert escaped.system["system.file"] == 'a "b"\\c.xlsx'
 
 
 def test_the_cardiac_template_has_hearts_with_and_without_defects():
@@ -54,25 +55,18 @@ def test_the_cardiac_template_has_hearts_with_and_without_defects():
     assert recipe.models["emission"]["attenuation.of_phantom"]
 
 
-def test_a_recipe_is_written_once_and_finds_its_workbook(tmp_path, capsys, monkeypatch):
+def test_a_recipe_is_written_once_and_finds_its_workbook(tmp_path, command, monkeypatch):
     monkeypatch.chdir(tmp_path)
     Path("scanner.xlsx").write_bytes(WORKBOOK.read_bytes())
-    assert main(["events", "new", "--like", "mixed", "--system", "scanner.xlsx", "-o", "recipes/mixed.toml"]) == 0
+    command("events", "new", "--like", "mixed", "--system", "scanner.xlsx", "-o", "recipes/mixed.toml")
     recipe = mph.events.read_recipe("recipes/mixed.toml")
     assert recipe.system["system.file"] == "../scanner.xlsx"
     assert len(mph.events.EventMaker(recipe).system) == 80
     before = Path("recipes/mixed.toml").read_bytes()
-    assert main(["events", "new", "-o", "recipes/mixed.toml"]) == 1  # edited by hand, perhaps
+    command("events", "new", "-o", "recipes/mixed.toml", status=1)  # edited by hand, perhaps
     assert Path("recipes/mixed.toml").read_bytes() == before
-    assert main(["events", "new", "--system", "none.xlsx"]) == 1
-    capsys.readouterr()
-    assert main(["events", "new", "--like", "cardiac"]) == 0
-    assert mph.events.EventRecipe(capsys.readouterr().out).seed == 1
-
-
-def test_a_workbooks_path_may_hold_what_toml_escapes():
-    recipe = mph.events.EventRecipe(template_text("derenzo", 'a "b"\\c.xlsx'))
-    assert recipe.system["system.file"] == 'a "b"\\c.xlsx'
+    command("events", "new", "--system", "none.xlsx", status=1)
+    assert mph.events.EventRecipe(command("events", "new", "--like", "cardiac").out).seed == 1
 
 
 @pytest.mark.long

@@ -45,14 +45,22 @@ def test_own_noise_is_that_of_the_set_in_every_epoch(event_set):
         assert np.array_equal(item["rays"], event.images("rays")), "only counts have noise"
 
 
-def test_levels_are_the_recipes_and_with_own_noise_the_same_in_every_epoch(event_set):
-    dataset = events.torch_dataset(event_set, ("counts",), noise="own")
-    first = [dataset[i] for i in range(5)]
-    assert {float(item["level"]) for item in first} <= set(event_set.recipe.levels) == {1.0}
-    dataset = events.torch_dataset(event_set, ("counts",), noise="own", levels=(1.0, 0.5, 0.25))
-    first = [dataset[i] for i in range(5)]
-    dataset.set_epoch(1)
-    assert all(same(item, dataset[i]) for i, item in enumerate(first))
+def test_levels_are_the_recipes_or_drawn_and_scale_the_counts(event_set):
+    """With own noise the same in every epoch."""
+    assert set(event_set.recipe.levels) == {1.0}
+    for noise, levels in (("own", ()), ("own", (1.0, 0.5, 0.25)), ("epoch", (1.0, 0.25))):
+        more = {"levels": levels} if levels else {}
+        dataset = events.torch_dataset(event_set, ("counts",), noise=noise, **more)
+        first, drawn = [dataset[i] for i in range(5)], set()
+        for epoch in range(4):
+            dataset.set_epoch(epoch)
+            items = [dataset[i] for i in range(5)]
+            assert noise == "epoch" or all(map(same, first, items))
+            drawn |= {float(item["level"]) for item in items}
+            for item, event in zip(items, event_set, strict=True):
+                expected = float(item["level"]) * event.images("counts").sum(dtype=float)
+                assert abs(float(item["counts"].sum(dtype=torch.float64)) - expected) < 6 * np.sqrt(expected)
+        assert drawn <= set(levels or (1.0,)) and (noise == "own" or drawn == set(levels))
 
 
 def test_noise_of_epochs_differs_and_repeats(event_set):
@@ -75,23 +83,10 @@ def test_noise_of_epochs_differs_and_repeats(event_set):
     assert 0.9 < ratio < 1.1
 
 
-def test_levels_are_drawn_and_scale_the_counts(event_set):
-    dataset = events.torch_dataset(event_set, ("counts",), noise="epoch", levels=(1.0, 0.25))
-    levels = set()
-    for epoch in range(4):
-        dataset.set_epoch(epoch)
-        for item, event in zip((dataset[i] for i in range(5)), event_set, strict=True):
-            expected = float(item["level"]) * event.images("counts").sum(dtype=float)
-            assert abs(float(item["counts"].sum(dtype=torch.float64)) - expected) < 6 * np.sqrt(expected)
-            levels.add(float(item["level"]))
-    assert levels == {1.0, 0.25}
-
-
-def test_crops_are_parts_of_the_fields_at_the_place_that_is_said(event_set):
+def test_crops_are_parts_of_the_fields_at_the_place_that_is_said_or_in_the_middle(event_set):
     crop = {"truth": (4, 5, 3), ("counts/slots", "radon16"): (None, 8, 6)}
     fields = ("truth", "affine", "counts/slots", "radon16")
-    dataset = events.torch_dataset(event_set, fields, crop=crop)
-    whole = events.torch_dataset(event_set, fields)
+    dataset, whole = events.torch_dataset(event_set, fields, crop=crop), events.torch_dataset(event_set, fields)
     places = set()
     for epoch in range(3):
         dataset.set_epoch(epoch)
@@ -108,12 +103,9 @@ def test_crops_are_parts_of_the_fields_at_the_place_that_is_said(event_set):
                 assert torch.equal(item[name], all_of_it[name][:, v : v + 8, u : u + 6])
             places.add((*start, v, u))
     assert len(places) > 10, "at random"
-
-
-def test_crops_in_the_middle_leave_as_much_on_both_sides(event_set):
-    item = events.torch_dataset(event_set, ("truth",), crop=4, crop_at="center")[0]
-    assert item["truth_start"].tolist() == [3, 2, 2]  # of 10, 9, 8
-    assert np.array_equal(item["truth"], event_set[0].truth.array[3:7, 2:6, 2:6])
+    middle = events.torch_dataset(event_set, ("truth",), crop=4, crop_at="center")[0]
+    assert middle["truth_start"].tolist() == [3, 2, 2]  # of 10, 9, 8
+    assert np.array_equal(middle["truth"], event_set[0].truth.array[3:7, 2:6, 2:6])
 
 
 def seen_by(dataset: Dataset, epochs: int, **options) -> list[list[dict]]:
@@ -141,17 +133,13 @@ def test_workers_give_what_one_process_gives_and_follow_the_epoch(start, event_s
     assert not same(kept[0][0], kept[1][0])
 
 
-def test_items_do_not_depend_on_the_part_of_the_set_that_is_read(event_set):
+def test_items_do_not_depend_on_the_part_of_the_set_that_is_read_and_survive_pickling(event_set):
     options = {"fields": ("counts", "truth"), "noise": "epoch", "crop": 4, "seed": 9}
     whole, part = events.torch_dataset(event_set, **options), events.torch_dataset(event_set[3:], **options)
     assert same(whole[3], part[0])
-
-
-def test_datasets_pickle(event_set):
-    dataset = events.torch_dataset(event_set, ("counts",), noise="epoch")
-    dataset.set_epoch(3)
-    again = pickle.loads(pickle.dumps(dataset))
-    assert again.epoch == 3 and same(again[0], dataset[0])
+    part.set_epoch(3)
+    again = pickle.loads(pickle.dumps(part))
+    assert again.epoch == 3 and same(again[0], part[0])
 
 
 @pytest.mark.parametrize(

@@ -52,9 +52,7 @@ CASES = {
     "CT numbers of padding": (TC | {"attenuation.file": "padded.npz", "attenuation.energy": 140.5}, "below -1024 HU"),
     "CT numbers of metal": (TC | {"attenuation.file": "metal.npz", "attenuation.energy": 140.5}, "above 3071 HU"),
     "CT numbers of water": (TC | {"attenuation.file": "water.npz", "attenuation.energy": 140.5}, "of water alone"),
-    "photons through CT numbers": (
-        {"volume.file": "metal.npz", "volume.energy": 60.0, "model.photons": 1e3}, "above 3071 HU",
-    ),
+    "photons through CT": ({"volume.file": "metal.npz", "volume.energy": 60.0, "model.photons": 1e3}, "above 3071 HU"),
     "no place in a file": (COUNTS | {"volume.file": "nowhere.nii"}, "does not say where the patient lies"),
     "phantom cut off": (COUNTS | {"phantom.kind": "shepp-logan", "phantom.spacing": (8.0,)}, "lies outside"),
     "rods that do not fit": (
@@ -84,9 +82,8 @@ def folder(tmp_path_factory) -> Path:
 
 def event_text(given: dict[str, Any]) -> str:
     """The recipe of events with the settings of a run: its first phantom is the run's."""
-    tables: dict[str, dict[str, Any]] = {
-        name: {} for name in ("system", "detector", "truth", "phantoms", "pose", "model")
-    }
+    names = ("system", "detector", "truth", "phantoms", "pose", "model")
+    tables: dict[str, dict[str, Any]] = {name: {} for name in names}
     is_mu = "model.photons" in given
     tables["truth"] = {"voxels": VOXELS, "spacing": given["phantom.spacing"][0]}
     tables["truth"]["quantity"] = "mu" if is_mu else "activity"
@@ -116,9 +113,8 @@ def event_text(given: dict[str, Any]) -> str:
 def test_an_event_gives_the_warnings_of_a_run_of_the_same_settings(folder, scanner, case):
     changes, expected = CASES[case]
     given = BASE | {key: str(folder / value) if key.endswith(".file") else value for key, value in changes.items()}
-    recipe = {
-        key: value for key, value in given.items() if "volume.file" not in given or not key.startswith("phantom.")
-    }
+    is_phantom = "volume.file" not in given
+    recipe = {key: value for key, value in given.items() if is_phantom or not key.startswith("phantom.")}
     with recorded_warnings() as of_run:
         (run,) = mph.run_recipe(mph.Recipe(recipe), scanner)
     with recorded_warnings() as of_set:

@@ -14,12 +14,10 @@ from typing import Any
 import psutil
 import pytest
 
-import mphdrr.core as mph
-from mphdrr.addon.cli import main
 from mphdrr.core import events
 from mphdrr.core.progress import Cancelled
 
-from .conftest import WORKBOOK
+from .conftest import WORKBOOK, refused, refused_command
 from .small_events import TEXT, small_recipe
 from .small_events import WORKBOOK as SMALL_WORKBOOK
 
@@ -47,14 +45,16 @@ def begin(folder: Path, *options: str, **how: Any) -> subprocess.Popen[str]:
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=folder, **how)
 
 
-def test_workers_and_shards_make_the_same_bytes(tmp_path, undisturbed):
+def test_workers_shards_and_parts_make_the_same_bytes(tmp_path, undisturbed):
     recipe = small_recipe(tmp_path)
     events.make(recipe, tmp_path / "two", COUNT, workers=2)
     assert tree(tmp_path / "two") == undisturbed
     for part in (2, 3, 1):
         made = [made.number for made in events.making(recipe, tmp_path / "shards", COUNT, shard=(part, 3))]
         assert made == [part - 1, part + 2]
-    assert tree(tmp_path / "shards") == undisturbed
+    events.make(recipe, tmp_path / "parts", 2, first=4)
+    assert events.make(recipe, tmp_path / "parts", COUNT).numbers == list(range(COUNT))
+    assert tree(tmp_path / "shards") == tree(tmp_path / "parts") == undisturbed
 
 
 def is_worker(process: psutil.Process) -> bool:
@@ -64,65 +64,55 @@ def is_worker(process: psutil.Process) -> bool:
         return False
 
 
+def events_in(folder: Path) -> list[Path]:
+    return list(folder.glob("set/events/[0-9]*"))
+
+
 @pytest.mark.long
-def test_dask_makes_the_same_bytes_though_a_worker_dies(tmp_path, undisturbed):
-    pytest.importorskip("distributed")
+@pytest.mark.parametrize(("options", "kills"), [((), 2), (("--dask", "local"), 1)])
+def test_killed_workers_cost_nothing_but_time(tmp_path, undisturbed, options, kills):
+    if options:
+        pytest.importorskip("distributed")
     small_recipe(tmp_path)
-    work = begin(tmp_path, "--workers", "2", "--dask", "local")
+    work = begin(tmp_path, "--workers", "2", *options)
     killed = 0
-    while work.poll() is None:
-        children = psutil.Process(work.pid).children(recursive=True)
-        workers = [] if killed else [child for child in children if is_worker(child)]
-        if workers and list(tmp_path.glob("set/events/*.h5")):
+    while work.poll() is None and killed < kills:
+        workers = [child for child in psutil.Process(work.pid).children(recursive=True) if is_worker(child)]
+        if workers and events_in(tmp_path):
             workers[0].kill()
             killed += 1
-        time.sleep(0.01)
-    assert work.returncode == 0, work.communicate()
-    assert killed == 1
+            time.sleep(0.3)
+        time.sleep(0.005)
+    assert work.wait(600) == 0 < killed, work.communicate()
     assert tree(tmp_path / "set") == undisturbed
 
 
 def test_a_cluster_that_does_not_answer_is_one_line(tmp_path, capsys, monkeypatch):
     small_recipe(tmp_path)
-    command = ["events", "make", str(tmp_path / "set"), "--recipe", str(tmp_path / "small.toml"), "-n", "2", "--quiet"]
+    words = ["events", "make", tmp_path / "set", "--recipe", tmp_path / "small.toml", "-n", 2, "--quiet", "--dask"]
     pytest.importorskip("distributed")
     monkeypatch.setattr("mphdrr.core.events.dask_work._ANSWER_SECONDS", 1)
-    assert main([*command, "--dask", "tcp://127.0.0.1:1"]) == 1
-    assert "mphdrr: --dask tcp://127.0.0.1:1: no scheduler answers there" in capsys.readouterr().err
+    address = "tcp://127.0.0.1:1"
+    assert f"--dask {address}: no scheduler answers there" in refused_command(capsys, *words, address)
     monkeypatch.setitem(sys.modules, "distributed", None)
-    assert main([*command, "--dask", "local"]) == 1
-    assert '--dask: distributed is missing: pip install "mphdrr[dask]"' in capsys.readouterr().err
-
-
-def test_parts_of_a_set_are_the_whole(tmp_path, undisturbed):
-    recipe = small_recipe(tmp_path)
-    events.make(recipe, tmp_path / "set", 2, first=4)
-    assert events.make(recipe, tmp_path / "set", COUNT).numbers == list(range(COUNT))
-    assert tree(tmp_path / "set") == undisturbed
+    missing = '--dask: distributed is missing: pip install "mphdrr[dask]"'
+    assert missing in refused_command(capsys, *words, "local")
 
 
 def test_cancelled_work_goes_on(tmp_path, undisturbed):
-    def stop(done: int, total: int) -> None:
-        if done == 3:
-            raise Cancelled
-
     recipe = small_recipe(tmp_path)
-    with pytest.raises(Cancelled):
-        events.make(recipe, tmp_path / "set", COUNT, progress=stop)
-    assert len(events.EventSet(tmp_path / "set")) == 3
+    # 3 events of 6, and 2 of the 3 others
+    for last, call in ((3, events.make), (2, lambda *job, **options: list(events.making(*job, **options)))):
 
-    def stop_within(done: int, total: int) -> None:
-        if done == 2:
-            raise Cancelled
+        def stop(done: int, total: int, last: int = last) -> None:
+            if done == last:
+                raise Cancelled
 
-    with pytest.raises(Cancelled):
-        list(events.making(recipe, tmp_path / "set", COUNT, progress=stop_within))
+        with pytest.raises(Cancelled):
+            call(recipe, tmp_path / "set", COUNT, progress=stop)
+        assert len(events.EventSet(tmp_path / "set")) >= 3
     events.make(recipe, tmp_path / "set", COUNT)
     assert tree(tmp_path / "set") == undisturbed
-
-
-def events_in(folder):
-    return list(folder.glob("set/events/[0-9]*"))
 
 
 @pytest.mark.long
@@ -150,27 +140,9 @@ def test_killed_work_goes_on_bit_for_bit(tmp_path, undisturbed, moments, workers
         psutil.wait_procs(children, timeout=20)
         assert not any(child.is_running() for child in children)  # none is left behind
         left.add(len(events_in(folder)))
-        assert (
-            main(["events", "make", str(folder / "set"), "--recipe", str(folder / "small.toml"), "-n", str(COUNT)]) == 0
-        )
+        assert begin(folder).wait(600) == 0
         assert tree(folder / "set") == undisturbed
     assert moments < 6 or len(left) > 2  # they were killed at different places
-
-
-@pytest.mark.long
-def test_a_killed_worker_costs_nothing_but_time(tmp_path, undisturbed):
-    small_recipe(tmp_path)
-    work = begin(tmp_path, "--workers", "2")
-    killed = 0
-    while work.poll() is None and killed < 2:
-        workers = [p for p in psutil.Process(work.pid).children() if "spawn_main" in " ".join(p.cmdline())]
-        if workers and list(tmp_path.glob("set/events/*.h5")):
-            workers[0].kill()
-            killed += 1
-            time.sleep(0.3)
-        time.sleep(0.005)
-    assert work.wait(600) == 0, work.communicate()
-    assert tree(tmp_path / "set") == undisturbed
 
 
 LONG = (
@@ -226,18 +198,17 @@ def test_workers_that_die_again_and_again_are_refused(tmp_path, monkeypatch):
     recipe = small_recipe(tmp_path)
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
     (tmp_path / "sitecustomize.py").write_text("import os, sys\nif '--multiprocessing-fork' in sys.argv: os._exit(9)\n")
-    with pytest.raises(mph.InputError, match=r"event 0: its worker ended 3 times before it was made .*fewer workers"):
-        events.make(recipe, tmp_path / "set", 3, workers=2)
+    words = "event 0: its worker ended 3 times before it was made .*fewer workers"
+    refused(lambda: events.make(recipe, tmp_path / "set", 3, workers=2), words)
 
 
 def test_what_a_worker_refuses_is_one_line(tmp_path, command):
     text = TEXT.replace("pixel_points = 1", 'pixel_points = 1\nattenuation = "phantom"').replace(
         'kind = "points"', 'kind = "points"\nspheres = 3'
     )
-    folder = tmp_path
-    (folder / "small.toml").write_text(text)
-    options = ["--recipe", folder / "small.toml", "-n", "3", "--workers", "2"]
-    said = command("events", "make", folder / "set", *options, status=1).err
+    (tmp_path / "small.toml").write_text(text)
+    options = ["--recipe", tmp_path / "small.toml", "-n", "3", "--workers", "2"]
+    said = command("events", "make", tmp_path / "set", *options, status=1).err
     assert "points: spheres: no such setting; expected counts" in said and "Traceback" not in said
 
 
@@ -256,31 +227,26 @@ def small_disk(tmp_path):
     subprocess.run(["umount", str(disk)], check=True)
 
 
-def test_a_full_disk_ends_with_one_line_and_a_set_that_resumes(tmp_path, small_disk, undisturbed, capsys):
+def test_a_full_disk_ends_with_one_line_and_a_set_that_resumes(tmp_path, small_disk, undisturbed, command):
     small_recipe(tmp_path)
-    command = ["events", "make", str(small_disk / "set"), "--recipe", str(tmp_path / "small.toml"), "--quiet"]
+    make = ["events", "make", small_disk / "set", "--recipe", tmp_path / "small.toml", "--quiet"]
+    make += ["-n", COUNT, "--workers", 2]
     (small_disk / "other").write_bytes(b"x" * 150_000)
-    assert main([*command, "-n", str(COUNT), "--workers", "2"]) == 1
-    said = [line for line in capsys.readouterr().err.splitlines() if "warning: only" not in line]
+    said = [line for line in command(*make, status=1).err.splitlines() if "warning: only" not in line]
     assert len(said) == 1 and "cannot be written (No space left on device)" in said[0], said
-    there = len(events.EventSet(small_disk / "set"))
-    assert 0 < there < COUNT
+    assert 0 < len(events.EventSet(small_disk / "set")) < COUNT
     assert not list(small_disk.glob("set/events/.*"))
     (small_disk / "other").unlink()
-    assert main([*command, "-n", str(COUNT), "--workers", "2"]) == 0
+    command(*make)
     assert tree(small_disk / "set") == undisturbed
 
 
-def test_the_command_says_what_it_does(tmp_path, capsys):
+def test_the_command_says_what_it_does(tmp_path, command):
     small_recipe(tmp_path)
-    folder = str(tmp_path / "set")
-    assert main(["events", "make", folder, "-n", "2"]) == 1
-    assert "it holds no recipe.toml: give --recipe FILE" in capsys.readouterr().err
-    assert main(["events", "make", folder, "--recipe", str(tmp_path / "small.toml"), "-n", "2", "--shard", "2/3"]) == 0
-    out = capsys.readouterr()
-    assert "1 of 2 events, 1 made now" in out.out and "up to" in out.err and "are free" in out.err
-    assert main(["events", "make", folder]) == 0
-    assert "2 of 2 events, 1 made now" in capsys.readouterr().out
-    assert main(["events", "make", folder, "--shard", "4/3"]) == 1
-    assert "shard: expected i/n with i from 1 to n, got 4/3" in capsys.readouterr().err
-    assert main(["events", "make", folder, "--shard", "x"]) == 2
+    make = ["events", "make", tmp_path / "set"]
+    assert "it holds no recipe.toml: give --recipe FILE" in command(*make, "-n", 2, status=1).err
+    said = command(*make, "--recipe", tmp_path / "small.toml", "-n", 2, "--shard", "2/3")
+    assert "1 of 2 events, 1 made now" in said.out and "up to" in said.err and "are free" in said.err
+    assert "2 of 2 events, 1 made now" in command(*make).out
+    assert "shard: expected i/n with i from 1 to n, got 4/3" in command(*make, "--shard", "4/3", status=1).err
+    command(*make, "--shard", "x", status=2)

@@ -21,7 +21,7 @@ from mphdrr.core import events
 from mphdrr.core.events.draws import Dice
 
 from .conftest import refused
-from .small_events import TEXT, WORKBOOK, small_recipe
+from .small_events import TEXT, WORKBOOK, small_recipe, with_phantoms
 
 AS_SHIPPED = True  # compared with voxels of every Python
 
@@ -68,9 +68,8 @@ def test_an_event_depends_on_recipe_seed_and_number_alone(tmp_path, small):
 
 def test_a_setting_that_is_added_changes_no_other(tmp_path):
     before = small_recipe(tmp_path)
-    after = small_recipe(
-        tmp_path, TEXT.replace('kind = "derenzo"', 'kind = "derenzo"\nheight = { from = 20, to = 40 }')
-    )
+    height = 'kind = "derenzo"\nheight = { from = 20, to = 40 }'
+    after = small_recipe(tmp_path, TEXT.replace('kind = "derenzo"', height))
     for number in range(20):
         a, b = events.plan(before, number), events.plan(after, number)
         for name in ("name", "position", "euler_degrees", "noise_seed"):
@@ -137,13 +136,9 @@ def test_random_numbers_are_numpys_seed_sequence():
 
 
 def test_uniform_turns_are_uniform(tmp_path):
-    text = TEXT.replace(
-        TEXT[TEXT.index("euler_degrees") : TEXT.index('[[phantoms]]\nkind = "points"')], 'turn = "uniform"\n\n'
-    )
-    recipe = small_recipe(tmp_path, text)
-    poses = np.array(
-        [plan.pose for plan in (events.plan(recipe, number) for number in range(3000)) if plan.name == "derenzo"]
-    )
+    entry = '[[phantoms]]\nkind = "derenzo"\nrod_diameters = [10, 0, 0, 0, 0, 0]\npose.turn = "uniform"\n'
+    recipe = small_recipe(tmp_path, with_phantoms(entry))
+    poses = np.array([events.plan(recipe, number).pose for number in range(2000)])
     axes = poses[:, :3, 2]  # of the rods: uniform on the sphere, so each part is uniform from -1 to 1
     assert np.abs(axes.mean(axis=0)).max() < 4 / math.sqrt(3 * len(axes))
     assert np.abs((axes**2).mean(axis=0) - 1 / 3).max() < 0.03
@@ -189,12 +184,9 @@ def test_the_index_says_what_the_files_hold(small):
         assert (row["event"], row["phantom"], row["split"]) == (event.number, event.name, event.split)
         assert [row["x_mm"], row["y_mm"], row["z_mm"]] == event.position.tolist()
         assert [row[f"{name}_degrees"] for name in ("phi", "theta", "psi")] == event.euler_degrees.tolist()
-        drawn = {
-            key.removeprefix("phantom."): value
-            for key, value in row.items()
-            if key.startswith("phantom.") and value is not None
-        }
-        assert all(np.allclose(event.settings[key], value) for key, value in drawn.items())
+        for key, value in row.items():
+            if key.startswith("phantom.") and value is not None:
+                assert np.allclose(event.settings[key.removeprefix("phantom.")], value)
 
 
 def test_an_event_becomes_a_run(small, tmp_path):
@@ -216,11 +208,8 @@ def test_an_event_becomes_a_run(small, tmp_path):
 def test_described_phantoms(tmp_path):
     ball = mph.ShapePhantom([mph.Sphere(radius=20, activity=3, mu=0.01, position=(5, 0, 0))])
     mph.write_phantom(ball, tmp_path / "ball.toml")
-    start, end = TEXT.index("[[phantoms]]"), TEXT.index("[models.lines]")
-    entry = '[[phantoms]]\nfile = "ball.toml"\n[phantoms.pose]\nturn = "uniform"\nposition = [3, 2, 1]\n\n'
-    recipe = small_recipe(
-        tmp_path, TEXT[:start] + entry + TEXT[end:].replace("time =", 'attenuation = "phantom"\ntime =')
-    )
+    entry = '[[phantoms]]\nfile = "ball.toml"\n[phantoms.pose]\nturn = "uniform"\nposition = [3, 2, 1]\n'
+    recipe = small_recipe(tmp_path, with_phantoms(entry).replace("time =", 'attenuation = "phantom"\ntime ='))
     event = events.make(recipe, tmp_path / "set", 1)[0]
     np.testing.assert_allclose(event.truth.array, ball.voxelize(recipe.grid, event.pose).array)
     run = event.run("emission")
@@ -256,12 +245,9 @@ def test_volumes_are_placed_like_phantoms(tmp_path):
     heart = mph.ShapePhantom([mph.Ellipsoid(radii=(24, 14, 10), activity=7, mu=0.02, position=(5, 3, -4))])
     mph.write_volume(heart.voxelize(grid), tmp_path / "heart.nii.gz")
     mph.write_volume(heart.voxelize(grid, quantity="mu"), tmp_path / "mu.nii.gz")
-    start, end = TEXT.index("[[phantoms]]"), TEXT.index("[models.lines]")
-    entry = (
-        '[[phantoms]]\nname = "heart"\nfile = "heart.nii.gz"\nmu_file = "mu.nii.gz"\n[phantoms.pose]\n'
-        "position = [4, 0, 3]\neuler_degrees = [30, 40, { from = 0, to = 360 }]\n\n"
-    )
-    text = TEXT[:start] + entry + TEXT[end:].replace("pixel_points", 'attenuation = "phantom"\npixel_points')
+    entry = '[[phantoms]]\nname = "heart"\nfile = "heart.nii.gz"\nmu_file = "mu.nii.gz"\n[phantoms.pose]\n'
+    entry += "position = [4, 0, 3]\neuler_degrees = [30, 40, { from = 0, to = 360 }]\n"
+    text = with_phantoms(entry).replace("pixel_points", 'attenuation = "phantom"\npixel_points')
     recipe = small_recipe(tmp_path, text)
     event = events.make(recipe, tmp_path / "set", 1)[0]
     exact = heart.voxelize(recipe.grid, event.pose)
@@ -288,9 +274,7 @@ def test_volumes_are_placed_like_phantoms(tmp_path):
 
 @pytest.mark.long
 def test_a_beating_torso_is_the_mean_of_its_gates(tmp_path):
-    start, end = TEXT.index("[[phantoms]]"), TEXT.index("[models.lines]")
-    entry = '[[phantoms]]\nkind = "torso"\ngates = 2\ndefect_severity = 0.5\n\n'
-    text = TEXT[:start] + entry + TEXT[end:]
+    text = with_phantoms('[[phantoms]]\nkind = "torso"\ngates = 2\ndefect_severity = 0.5\n')
     text = text.replace("spacing = 6.0", "spacing = 24.0").replace("voxels = 16", "voxels = 6")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
@@ -354,27 +338,21 @@ def test_what_is_not_understood_is_refused_by_name(tmp_path, old, new, said):
 def test_numbers_as_earlier_versions_took_them(tmp_path):
     """Recipes of before open, whatever they wrote for a number, and the events are those of the number itself."""
     before = ("counts = [{ from = 1, to = 3 }, 2, 1]", "angles = [6, 8]")
-    plain = ("counts = { one_of = [[2, 2, 1], [3, 2, 1]] }", "angles = [6, 8]", "mirror = 1", "size = { one_of = [1] }")
-    other = (
-        *("counts = { one_of = [[2.0, 2, 1], [3.0, 2.0, 1]] }", "angles = [6.0, 8]", "mirror = true"),
-        "size = { one_of = [true] }",
-    )
+    plain = ("[[2, 2, 1], [3, 2, 1]]", "[6, 8]", "mirror = 1\nsize = { one_of = [1] }")
+    other = ("[[2.0, 2, 1], [3.0, 2.0, 1]]", "[6.0, 8]", "mirror = true\nsize = { one_of = [true] }")
     rows = []
-    for counts, angles, *augmentation in (plain, other):
-        text = TEXT.replace(before[0], counts).replace(before[1], angles)
-        recipe = small_recipe(tmp_path, "\n".join([text, "[augmentation]", *augmentation]))
+    for counts, angles, augmentation in (plain, other):
+        text = TEXT.replace(before[0], f"counts = {{ one_of = {counts} }}").replace(before[1], f"angles = {angles}")
+        recipe = small_recipe(tmp_path, f"{text}\n[augmentation]\n{augmentation}")
         assert recipe.radon is not None and recipe.radon.counts == (6, 8)
         rows.append([events.plan(recipe, number).row() for number in range(8)])
     assert rows[0] == rows[1] and any(row["phantom"] == "points" for row in rows[0])
 
 
-def test_shares_may_be_rounded(tmp_path):
+def test_shares_may_be_rounded_and_a_set_that_was_begun_with_other_shares_goes_on(tmp_path, monkeypatch):
+    """Earlier versions divided the shares by their sum, which rounding still does."""
     text = TEXT.replace("train = 0.8", "train = 0.3333333\nb = 0.3333333").replace("test = 0.2", "test = 0.3333333")
     assert sum(small_recipe(tmp_path, text).splits.values()) == pytest.approx(1, abs=1e-15)
-
-
-def test_a_set_that_was_begun_with_other_shares_goes_on(tmp_path, monkeypatch):
-    """Earlier versions divided the shares by their sum."""
     text = TEXT.replace("train = 0.8", "train = 4").replace("test = 0.2", "test = 1")
     with monkeypatch.context() as earlier:
         earlier.setattr("mphdrr.core.events.recipe.abs", lambda _: 0.0, raising=False)
@@ -416,13 +394,13 @@ def test_other_seeds_are_refused_wherever_they_enter(event_set, scanner, tmp_pat
 def test_another_recipe_in_the_folder_is_refused(tmp_path, small):
     folder = small[0].path.parents[1]
     before = {path: path.stat().st_mtime_ns for path in folder.rglob("*")}
-    with pytest.raises(mph.InputError, match=r"recipe.toml: another recipe: choose another folder"):
-        events.make(small_recipe(tmp_path, TEXT.replace("seed = 5", "seed = 6")), folder, 8)
+    other = small_recipe(tmp_path, TEXT.replace("seed = 5", "seed = 6"))
+    refused(lambda: events.make(other, folder, 8), "recipe.toml: another recipe: choose another folder")
     assert {path: path.stat().st_mtime_ns for path in folder.rglob("*")} == before
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "thesis.txt").write_text("mine")
-    with pytest.raises(mph.InputError, match=r"holds thesis\.txt and no recipe\.toml: choose a new folder"):
-        events.make(small_recipe(tmp_path), tmp_path / "mine", 1)
+    words = "holds thesis.txt and no recipe.toml: choose a new folder"
+    refused(lambda: events.make(small_recipe(tmp_path), tmp_path / "mine", 1), words)
 
 
 def test_a_set_grows_and_keeps_what_it_has(tmp_path):

@@ -141,9 +141,8 @@ def test_pixels_and_svg_show_the_same_drawing(tmp_path):
 def test_resizing_keeps_means():
     picture = np.random.default_rng(3).random((31, 47, 2))
     for shape in ((7, 10), (31, 47), (62, 94), (100, 33)):
-        np.testing.assert_allclose(
-            resize_picture(picture, *shape).mean(axis=(0, 1)), picture.mean(axis=(0, 1)), rtol=1e-5
-        )
+        means = resize_picture(picture, *shape).mean(axis=(0, 1))
+        np.testing.assert_allclose(means, picture.mean(axis=(0, 1)), rtol=1e-5)
     np.testing.assert_allclose(resize_picture(picture, 62, 94)[::2, 1::2], picture, rtol=1e-5)
 
 
@@ -151,16 +150,13 @@ def figure(*words: object) -> int:
     return main(["figure", *map(str, words)])
 
 
-def test_the_command_lists_and_draws(tmp_path, capsys):
+def test_the_command_lists_and_draws_phantoms_runs_and_volumes(subject, tmp_path, capsys):
     assert figure("--list") == 0
     assert [line.split()[0] for line in capsys.readouterr().out.splitlines()] == list(KINDS)
     out, pose = tmp_path / "sums.svg", ("--euler-degrees", 30, 55, 0, "--position", 5, 0, 0)
     assert figure("sums", "derenzo", "--voxels", 24, *pose, "-o", out) == 0
     assert "T = (5, 0, 0) mm    R = (φ, θ, ψ) = (30, 55, 0)°" in out.read_text(encoding="utf-8")
     assert capsys.readouterr().out == f"{out}\n"
-
-
-def test_the_command_takes_runs_and_volumes(subject, tmp_path):
     mph.write_run(subject.run, tmp_path / "run.npz")
     mph.write_volume(subject.volume, tmp_path / "volume.npz")
     size = ("--size", "400x300")

@@ -45,6 +45,7 @@ def files(folder: Path, **texts: object) -> None:
         (folder / name.replace("__", ".")).write_text(f"{text}\n")
 
 
+VERSION_1 = "36 31 0:33 / SYS/cpu rw - cgroup cgroup rw,cpu,cpuacct\n"
 VERSION_2 = "35 31 0:32 / SYS rw,relatime shared:9 - cgroup2 cgroup2 rw\n"
 
 
@@ -69,8 +70,7 @@ def test_the_narrowest_group_of_version_2_counts_and_its_page_cache_is_free(job,
 @pytest.mark.parametrize("root, path", [("/", "/pbs/42"), ("/docker/ab", "/docker/ab"), ("/", "/../42"), ("/x", "/y")])
 def test_groups_of_version_1_are_found_in_containers_too(job, root, path):
     mounts = f"35 31 0:32 {root} SYS/memory rw - cgroup cgroup rw,memory\n"
-    mounts += "36 31 0:33 / SYS/cpu rw - cgroup cgroup rw,cpu,cpuacct\n"
-    groups(job, f"4:memory:{path}\n1:cpu,cpuacct:/some\n0::/\n", mounts)
+    groups(job, f"4:memory:{path}\n1:cpu,cpuacct:/some\n0::/\n", mounts + VERSION_1)
     where = job / "memory" / ("pbs/42" if path == "/pbs/42" else "")
     stat = f"inactive_file 3\ntotal_inactive_file {100 * MIB}"
     files(where, memory__limit_in_bytes=600 * MIB, memory__usage_in_bytes=200 * MIB, memory__stat=stat)
@@ -87,23 +87,20 @@ def test_what_is_used_beyond_the_limit_leaves_nothing(job):
     refused(lambda: memory.require(1, "a pixel"), "a pixel needs", "0 KiB can be used")
 
 
-@pytest.mark.parametrize(
-    "quota, cores", [("max 100000", None), ("50000 100000", 1), ("130000 100000", 2), ("1000 1000000", 1)]
-)
-def test_a_share_of_the_processors_time_is_rounded_up_to_cores(job, monkeypatch, quota, cores):
+@pytest.mark.parametrize("version, quota, cores", [
+    (2, "max 100000", None), (2, "50000 100000", 1), (2, "130000 100000", 2), (2, "1000 1000000", 1),
+    (1, "-1 100000", None), (1, "250000 100000", 3), (1, "9000000 100000", None),
+])  # fmt: skip
+def test_a_share_of_the_processors_time_is_rounded_up_to_cores(job, monkeypatch, version, quota, cores):
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(64)), raising=False)
-    groups(job, "0::/a/b\n", VERSION_2)
-    files(job / "a", cpu__max=quota)
+    if version == 2:
+        groups(job, "0::/a/b\n", VERSION_2)
+        files(job / "a", cpu__max=quota)
+    else:  # quota and period apart
+        groups(job, "2:cpu,cpuacct:/q\n", VERSION_1)
+        files(job / "cpu/q", **dict(zip(("cpu__cfs_quota_us", "cpu__cfs_period_us"), quota.split(), strict=True)))
     assert memory.cores() == thread_count(None) == (cores or 64)
     assert [threads_per_worker(n) for n in (1, 2, 100)] == [cores or 64, max(1, (cores or 64) // 2), 1]
-
-
-@pytest.mark.parametrize("quota, cores", [("-1", 6), ("250000", 3), ("900000", 6)])
-def test_version_1_says_quota_and_period_apart(job, monkeypatch, quota, cores):
-    monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(6)), raising=False)
-    groups(job, "2:cpu,cpuacct:/q\n", "36 31 0:33 / SYS/cpu rw - cgroup cgroup rw,cpu,cpuacct\n")
-    files(job / "cpu/q", cpu__cfs_quota_us=quota, cpu__cfs_period_us=100000)
-    assert memory.cores() == cores
 
 
 @pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="processes have no affinity here")

@@ -89,9 +89,8 @@ class Volume(NamedTuple):
         """Return half widths or radii at the lower and the upper end of a frustum, and its height, mm."""
         if self.shape == "trap":
             assert all(self.settings[f"geometry/set{a}"] == ["0", "deg"] for a in ("Theta", "Phi", "Alp1", "Alp2"))
-            lower, upper = (
-                [self.length(f"set{a}") for a in axes] for axes in (("Dx1", "Dy1", "Dx2"), ("Dx3", "Dy2", "Dx4"))
-            )
+            ends = ("Dx1", "Dy1", "Dx2"), ("Dx3", "Dy2", "Dx4")
+            lower, upper = ([self.length(f"set{a}") for a in axes] for axes in ends)
             assert len({*lower}) == len({*upper}) == 1
             return lower[0], upper[0], 2 * self.length("setDz")
         assert self.shape == "cone"
@@ -143,9 +142,8 @@ class Macros:
                 volumes[named] = {"mother": name, "shape": words[0]}
             else:
                 settings[name][key] = words
-        return {
-            name: Volume(**v, settings=settings[name], **self._places(settings[name])) for name, v in volumes.items()
-        }
+        places = {name: self._places(settings[name]) for name in volumes}
+        return {name: Volume(**v, settings=settings[name], **places[name]) for name, v in volumes.items()}
 
     def _places(self, settings: dict[str, list[str]]) -> dict[str, np.ndarray]:
         if "repeaters/insert" not in settings:
@@ -425,17 +423,14 @@ json.dump(described, open("described.json", "w"))
 
 def run_gate10(folder: Path, *command: str, **variables: str) -> str:
     """The output of GATE 10; it must not look for Geant4's data, which it would download."""
-    environment = {**os.environ, "GATEONRTD": "1", **variables}
-    run = subprocess.run(
-        [sys.executable, *command], cwd=folder, env=environment, capture_output=True, text=True, timeout=600
-    )
+    options = {"cwd": folder, "env": {**os.environ, "GATEONRTD": "1", **variables}, "timeout": 600}
+    run = subprocess.run([sys.executable, *command], capture_output=True, text=True, **options)
     assert run.returncode == 0, run.stderr
     return run.stdout + run.stderr
 
 
-needs_gate10 = pytest.mark.skipif(
-    importlib.util.find_spec("opengate") is None, reason="needs opengate (GATE 10): pip install opengate"
-)
+has_gate10 = importlib.util.find_spec("opengate") is not None
+needs_gate10 = pytest.mark.skipif(not has_gate10, reason="needs opengate (GATE 10): pip install opengate")
 
 
 def cubic(shape: str, *size: float) -> float:
@@ -449,9 +444,8 @@ def cubic(shape: str, *size: float) -> float:
 
 @needs_gate10
 def test_gate10_builds_the_scanner_in_geant4(scanner, tmp_path) -> None:
-    folder = export(
-        scanner, tmp_path / "g10", "gate10", phantom="derenzo", euler_degrees=(20, 50, -10), position=(3, -5, 8)
-    )
+    pose = {"euler_degrees": (20, 50, -10), "position": (3, -5, 8)}
+    folder = export(scanner, tmp_path / "g10", "gate10", phantom="derenzo", **pose)
     printed = run_gate10(folder, "-c", _DRIVER)
     data, described = (json.loads((folder / f"{name}.json").read_text()) for name in ("simulation", "described"))
     assert printed.count("OK!") == sum(len(v["centers_mm"]) for v in data["volumes"])  # no overlap of any of them

@@ -82,9 +82,8 @@ def test_background_regions_keep_their_distances():
         away = np.linalg.norm((score.background_regions - sphere.center)[:, :2], axis=1)
         assert away.min() >= sphere.diameter / 2 + 15 + 18.5
     x, y = score.background_regions[:12, :2].T
-    edge = np.stack([x, y], axis=1)[:, None] + (18.5 + 14.9) * np.exp(1j * np.linspace(0, 6.28, 60)).view(
-        float
-    ).reshape(-1, 2)
+    turn = np.linspace(0, 6.28, 60)
+    edge = np.stack([x, y], axis=1)[:, None] + (18.5 + 14.9) * np.stack([np.cos(turn), np.sin(turn)], axis=1)
     inside = BODY.values(np.concatenate([edge.reshape(-1, 2), np.zeros((edge.size // 2, 1))], axis=1))
     assert (inside == BODY.background).all()  # neither beyond the outline nor in the lung insert
 

@@ -13,7 +13,7 @@ from mphdrr.core import events
 from mphdrr.core.cli import main
 
 from .conftest import BACKENDS, WORKBOOK, refused
-from .small_events import WORKBOOK as FEWER_MODULES
+from .small_events import TEXT, small_recipe
 
 DEPTH = 50.0  # mm of water before the source
 RAYS = {"hole": "rays", "aperture_points": 1, "pixel_points": 1, "tolerance": 1e9}
@@ -56,10 +56,8 @@ def test_a_window_counts_each_lines_part_of_the_gaussian(module, name, window):
     isotope = mph.isotope(name)
     reference, _ = max(isotope.lines_within(*model.window), key=lambda line: line[1])
     found = dict(model.photon_lines)
-    shares = {
-        energy: photons * gaussian_share(energy, model.window, 0.095 * math.sqrt(reference * energy))
-        for energy, photons in isotope.lines
-    }
+    widths = {energy: 0.095 * math.sqrt(reference * energy) for energy, _ in isotope.lines}
+    shares = {energy: n * gaussian_share(energy, model.window, widths[energy]) for energy, n in isotope.lines}
     least = 1e-4 * max(shares.values())
     assert list(found) == [energy for energy, share in shares.items() if share > least]
     for energy, photons in found.items():
@@ -136,15 +134,12 @@ def test_one_line_is_computed_as_ever_bit_for_bit(system, ct, rng):
 def test_lines_apart_without_attenuation_have_their_own_holes_and_crystals(system, rng):
     grid, views = mph.Grid.centered((7, 6, 5), 12.0), system.views((8, 9))
     x = rng.random(grid.shape)
-    plain, apart = (
-        mph.Projector(grid, views, several(system, aperture_mu=None, crystal_mu=None, lines=word))
-        for word in ("together", "apart")
-    )
+    models = (several(system, aperture_mu=None, crystal_mu=None, lines=word) for word in ("together", "apart"))
+    plain, apart = (mph.Projector(grid, views, model) for model in models)
     np.testing.assert_allclose(apart(x), plain(x), rtol=1e-5)
     model = several(system, lines="apart", photons_per_decay=2.0, intrinsic_fwhm=3.0)
-    assert [part.aperture_mu for part in model.parts()] == [
-        mph.attenuation("tungsten", e) for e in (284.3, 364.5, 637.0)
-    ]
+    energies = (284.3, 364.5, 637.0)
+    assert [part.aperture_mu for part in model.parts()] == [mph.attenuation("tungsten", e) for e in energies]
     assert sum(part.photons_per_decay for part in model.parts()) == pytest.approx(2.0)
     again = dataclasses.replace(model, time=20.0)
     assert [part.crystal_mu for part in again.parts()] == [part.crystal_mu for part in model.parts()]
@@ -159,9 +154,8 @@ def test_lines_apart_have_the_times_and_efficiencies_of_the_modules(system, rng)
     x, y = rng.random(grid.shape), rng.random((12, 8, 9))
     efficiency = rng.uniform(0.5, 1.5, (12, 8, 9)) * (rng.random((12, 8, 9)) > 0.1)
     own = {"time": rng.uniform(10, 20, 12), "start": 3600.0 * np.arange(12), "lines": "apart"}
-    even, uneven = (
-        mph.Projector(grid, views, several(system, **own, efficiency=e), double=True) for e in (1.0, efficiency)
-    )
+    models = (several(system, **own, efficiency=e) for e in (1.0, efficiency))
+    even, uneven = (mph.Projector(grid, views, model, double=True) for model in models)
     np.testing.assert_allclose(uneven(x), efficiency * even(x), rtol=1e-12)
     np.testing.assert_allclose(uneven.T(y), even.T(efficiency * y), rtol=1e-9)
     factor = several(system, **own).effective_time / several(system, time=10.0).effective_time
@@ -225,13 +219,11 @@ def test_recipes_take_ct_numbers_at_each_line(system, ct, tmp_path):
     mph.write_volume(ct, tmp_path / "ct.nii.gz")
     kept = mph.read_volume(tmp_path / "ct.nii.gz")
     volume = mph.Volume(np.ones((4, 4, 4)), mph.Grid.centered(4, 15.0), "activity")
-    recipe = mph.Recipe(
-        {
-            "model.kind": "emission", "model.isotope": "In-111", "model.window": (150, 270), "model.energy_fwhm": 0.1,
-            "attenuation.file": str(tmp_path / "ct.nii.gz"), "attenuation.energy": "lines",
-            "detector.rows": 6, "detector.columns": 6,
-        }
-    )  # fmt: skip
+    recipe = mph.Recipe({
+        "model.kind": "emission", "model.isotope": "In-111", "model.window": (150, 270), "model.energy_fwhm": 0.1,
+        "attenuation.file": str(tmp_path / "ct.nii.gz"), "attenuation.energy": "lines",
+        "detector.rows": 6, "detector.columns": 6,
+    })  # fmt: skip
     (run,) = mph.run_recipe(recipe, system, volume)
     model = mph.Emission(system, kept, isotope="In-111", window=(150, 270), energy_fwhm=0.1)
     A = mph.Projector(volume.grid, run.views, model)
@@ -273,45 +265,22 @@ def test_recipes_and_options_take_a_file_of_mu_for_each_line(system, mu_files, t
     swapped = mph.Projector(volume.grid, other.views, mph.Emission(other.system, mu[::-1], **counted))
     np.testing.assert_allclose(other.projections, swapped(volume), rtol=1e-6)
     np.testing.assert_allclose(mph.projector_of_run(other, volume.grid)(volume), other.projections, rtol=1e-6)
-
-    def assert_refused(wrong, *words):
-        refused(lambda: next(mph.run_recipe(wrong, system, volume)), *words)
-
-    for number in (2, 3):
-        window = (150, 270) if number == 3 else (160, 180)
-        wrong = {"attenuation.file": files[:1] * number, "model.window": window, "model.energy_fwhm": None}
-        assert_refused(recipe.updated(wrong), "attenuation.file", f"got {number}")
-    assert_refused(recipe.updated({"attenuation.energy": 171.3}), "attenuation.energy", "one file")
+    one_line = {"model.window": (160, 180), "model.energy_fwhm": None}
+    for changes, words in (
+        ({"attenuation.file": files[:1] * 2} | one_line, ("attenuation.file", "got 2")),
+        ({"attenuation.file": files[:1] * 3, "model.energy_fwhm": None}, ("attenuation.file", "got 3")),
+        ({"attenuation.energy": 171.3}, ("attenuation.energy", "one file")),
+    ):
+        refused(lambda changes=changes: next(mph.run_recipe(recipe.updated(changes), system, volume)), *words)
 
 
 @pytest.mark.parametrize("each", [False, True])
 def test_event_sets_keep_what_attenuates_each_line(each, ct, mu_files, tmp_path):
     mph.write_volume(ct, tmp_path / "ct.nii.gz")
-    given = 'attenuation = ["171.nii.gz", "245.nii.gz"]'
-    if not each:
-        given = 'attenuation = "ct.nii.gz"\nattenuation_energy = "lines"'
-    text = f"""
-version = 1
-[system]
-file = '{FEWER_MODULES}'
-modules = "1-3"
-[detector]
-rows = 6
-columns = 6
-[truth]
-voxels = 6
-spacing = 15
-[[phantoms]]
-kind = "derenzo"
-[models.counts]
-kind = "emission"
-isotope = "In-111"
-window = [150, 270]
-{given}
-"""
-    (tmp_path / "recipe.toml").write_text(text)
-    events.make(events.read_recipe(tmp_path / "recipe.toml"), tmp_path / "set", 1)
-    event = events.EventSet(tmp_path / "set")[0]
+    given = '["171.nii.gz", "245.nii.gz"]' if each else '"ct.nii.gz"\nattenuation_energy = "lines"'
+    counts = f'kind = "emission"\nisotope = "In-111"\nwindow = [150, 270]\nattenuation = {given}\n'
+    text = TEXT[: TEXT.index("[models.lines]")] + f"[models.counts]\n{counts}"
+    (event,) = events.make(small_recipe(tmp_path, text.replace('"1-4,21-24"', '"1-3"')), tmp_path / "set", 1)
     run = event.run("counts")
     A = mph.projector_of_run(run, event.truth.grid)
     assert len(A.model.parts()) == 2 and isinstance(A.model.mu, tuple) == each

@@ -45,8 +45,8 @@ def file(run, tmp_path) -> str:
     return str(tmp_path / "run.npz")
 
 
-def command(*words: object, said: str = "") -> None:
-    assert main(["reconstruct", *map(str, words)]) == 0, said
+def command(*words: object) -> None:
+    assert main(["reconstruct", *map(str, words)]) == 0
 
 
 def refusal(capsys, *words: object) -> str:
@@ -67,14 +67,13 @@ MODEL = {
 def test_runs_of_version_0_1_0_reconstruct_when_the_model_is_given(suffix, tmp_path, capsys):
     file, recipe = str(OLD / f"run-0.1.0{suffix}"), tmp_path / "model.toml"
     small = ["--voxels", "5", "--spacing", "18", "--iterations", "3", "--method", "mlem", "--quiet"]
-    assert main(["reconstruct", file, *small, "-o", str(tmp_path / "a.npz")]) == 1
-    said = capsys.readouterr().err
-    assert said.count("\n") == 1 and "holds no recipe" in said and "--set model.kind=emission" in said
+    said = refusal(capsys, file, *small, "-o", tmp_path / "a.npz")
+    assert "holds no recipe" in said and "--set model.kind=emission" in said
     entries = [word for key, value in MODEL.items() for word in ("--set", f"{key}={value}")]
-    assert main(["reconstruct", file, *small, *entries, "-o", str(tmp_path / "a.npz")]) == 0
+    command(file, *small, *entries, "-o", tmp_path / "a.npz")
     assert "warning" not in capsys.readouterr().err
     mph.write_recipe(mph.Recipe(MODEL), recipe)
-    assert main(["reconstruct", file, *small, "--recipe", str(recipe), "-o", str(tmp_path / "b.npz")]) == 0
+    command(file, *small, "--recipe", recipe, "-o", tmp_path / "b.npz")
     by_options, by_recipe = (mph.read_volume(tmp_path / f"{name}.npz") for name in "ab")
     np.testing.assert_array_equal(by_options.array, by_recipe.array)
 
@@ -221,6 +220,7 @@ def test_every_argument_of_a_method_or_prior_is_a_setting():
         ("sirt", ["--set", "reconstruction.nonnegative=false"], {"nonnegative": False}),
         ("tv", ["--weight", "0.1", "--no-nonnegative"], {"weight": 0.1, "nonnegative": False}),
         ("bsrem", ["--step-decay", "0.5", "--hole", "rays"], {"step_decay": 0.5}),
+        ("osem", ["--prior", "relative-difference", "--weight", "0.5"], {"prior": mph.RelativeDifference(0.5)}),
     ],
 )
 def test_a_methods_own_settings_reach_it(name, typed, given, run, radiograph, tmp_path, capsys):
@@ -273,8 +273,8 @@ def test_a_file_is_a_method_without_iterations_or_an_objective(toy, radiograph, 
     command(*small, "--method", toy, "--no-nonnegative", "--write-recipe", tmp_path / "how" / "r.toml")
     monkeypatch.chdir("/")
     assert '"../model.toy"' in (tmp_path / "how" / "r.toml").read_text(encoding="utf-8").replace("\\", "/")
-    found = mph.reconstruct_run(radiograph, mph.read_recipe(tmp_path / "how" / "r.toml"))
-    assert (found.volume.array == -0.5).all()
+    result = mph.reconstruct_run(radiograph, mph.read_recipe(tmp_path / "how" / "r.toml"))
+    assert (result.volume.array == -0.5).all()
     capsys.readouterr()
     for more, words in (
         (["--iterations", "3"], "reconstruction.iterations (--iterations): Even does not take it"),
@@ -316,18 +316,6 @@ def test_stopping_and_watching(run):
     assert easy.iterations == 2 and easy.settings["stopped"] == "change"
     noisy = how | {"reconstruction.stop_noise": 1e-6, "reconstruction.stop_region": (0, 0, 0, 20)}
     assert mph.reconstruct_run(run, mph.Recipe(noisy), watch=lambda *_: None).settings["stopped"] == "noise"
-
-
-def test_a_prior_makes_it_smoother(run):
-    how = {"reconstruction.voxels": 20, "reconstruction.spacing": 5, "reconstruction.iterations": 4,
-           "reconstruction.hole": "rays"}  # fmt: skip
-    smooth = how | {"reconstruction.prior": "relative-difference", "reconstruction.weight": 0.5}
-    plain, found = (mph.reconstruct_run(run, mph.Recipe(entries)).volume.array for entries in (how, smooth))
-
-    def roughness(array):
-        return np.abs(np.diff(array, axis=0)).sum() / array.sum()
-
-    assert roughness(found) < 0.9 * roughness(plain)
 
 
 def test_voxels_cover_the_roi_and_the_model_is_that_of_the_run(run):
@@ -376,9 +364,9 @@ def test_radiographs_are_reconstructed_by_least_squares(method, photons, scanner
     mph.write_run(run, tmp_path / "run.npz")
     how = [*method, "--voxels", "10", "--spacing", "8"]
     command(tmp_path / "run.npz", "--method", *how, "-o", tmp_path / "v.npz", "--picture", tmp_path / "p.svg")
-    found = mph.read_volume(tmp_path / "v.npz")
-    inside = mph.resample(ball, found.grid, "mean").array > 0.0199
-    assert found.quantity == "mu" and found.array[inside].mean() == pytest.approx(0.02, rel=0.1)
+    volume = mph.read_volume(tmp_path / "v.npz")
+    inside = mph.resample(ball, volume.grid, "mean").array > 0.0199
+    assert volume.quantity == "mu" and volume.array[inside].mean() == pytest.approx(0.02, rel=0.1)
     assert "squared error" in capsys.readouterr().err
 
 
@@ -417,14 +405,12 @@ def test_the_picture_shows_slices_beside_the_truth_and_the_objective(run, file, 
 
 @pytest.mark.parametrize("size", [(240, 240), (1600, 500), (500, 900)])
 def test_slices_lie_on_the_page_and_have_the_right_colours(size):
-    grid = mph.Grid.centered((12, 10, 8), 2.0)
-    array = np.zeros(grid.shape, np.float32)
+    array = np.zeros((12, 10, 8), np.float32)
     array[9:, :, :] = 50.0
     page = Page(*size)
-    draw(page, mph.Volume(array, grid, "activity"), [], None)
-    picture = page.picture
-    hot = (np.abs(picture.astype(int) - (252, 255, 164)).max(axis=2) < 8).sum()
-    cold = (picture.max(axis=2) < 6).sum()
+    draw(page, mph.Volume(array, mph.Grid.centered(array.shape, 2.0), "activity"), [], None)
+    hot = (np.abs(page.picture.astype(int) - (252, 255, 164)).max(axis=2) < 8).sum()
+    cold = (page.picture.max(axis=2) < 6).sum()
     assert hot > cold > 0, "what is shown is where there is something, and a margin"
 
 

@@ -12,9 +12,10 @@ from PIL import Image
 from scipy.ndimage import gaussian_filter
 
 import mphdrr.core as mph
-from mphdrr.core.cli import main
 from mphdrr.core.figures.page import Page
 from mphdrr.core.figures.scores import SIZE, draw
+
+from .conftest import refused
 
 RODS = (5.0, 4.0, 0.0, 3.0, 2.5, 1.2)
 PHANTOM = mph.DerenzoPhantom(24.0, RODS, 20.0, activity=100.0)
@@ -102,74 +103,54 @@ def test_the_table_of_spheres():
     ],
 )
 def test_what_cannot_be_scored_is_refused(volume, truth, pose, message):
-    known = {
-        name: mph.Volume(np.ones((12, 12, 12)), mph.Grid.centered(12, 1.0), name if name != "volume" else "activity")
-        for name in ("volume", "mu", "hu")
-    }
-    with pytest.raises(mph.InputError, match=message):
-        mph.score_volume(known.get(volume, volume), known.get(truth, truth) if isinstance(truth, str) else truth, pose)
+    grid, quantities = mph.Grid.centered(12, 1.0), {"volume": "activity", "mu": "mu", "hu": "hu"}
+    volumes = {name: mph.Volume(np.ones(grid.shape), grid, quantity) for name, quantity in quantities.items()}
+    truth = volumes.get(truth, truth) if isinstance(truth, str) else truth
+    refused(lambda: mph.score_volume(volumes.get(volume, volume), truth, pose), message)
 
 
 PLACE = ["--position", "1", "2", "3", "--euler", "0", "20", "0"]
 
 
-@pytest.mark.parametrize("order", ["kind last", "kind first", "toml"])
-def test_a_phantom_on_the_command_line(files, expected, capsys, order):
-    volume = str(files / "volume.nii.gz")
-    ways = {
-        "kind last": [*PLACE, "--json", *OPTIONS],
-        "kind first": [*OPTIONS, *PLACE, "--json"],
-        "toml": ["--truth", str(files / "truth.toml"), *PLACE, "--json"],
-    }
-    assert main(["score", volume, *ways[order]]) == 0
-    record = json.loads(capsys.readouterr().out)
+@pytest.mark.parametrize("words", [[*PLACE, *OPTIONS], [*OPTIONS, *PLACE], ["--truth", "TOML", *PLACE]])
+def test_a_phantom_on_the_command_line(files, expected, command, words):
+    words = [files / "truth.toml" if word == "TOML" else word for word in words]
+    record = json.loads(command("score", files / "volume.nii.gz", "--json", *words).out)
     assert record["nrmse"] == pytest.approx(expected.nrmse, rel=1e-4)
     assert record["derenzo"][3]["resolved"] == expected.derenzo[3].resolved
     assert record["derenzo"][5]["valley_to_peak"] is None
 
 
-@pytest.mark.parametrize("suffix", [".png", ".svg"])
-def test_the_picture_shows_volume_and_truth(files, tmp_path, capsys, suffix):
-    picture = tmp_path / "new" / f"score{suffix}"
-    arguments = ["score", str(files / "volume.nii.gz"), "--truth", str(files / "truth.toml"), *PLACE]
-    assert main([*arguments, "--picture", str(picture)]) == 0
-    assert capsys.readouterr().out.splitlines()[0].startswith("All voxels: NRMSE 0.")
-    if suffix == ".png":
-        pixels = np.asarray(Image.open(picture).convert("RGB"))
-        assert pixels.shape[:2] == SIZE[::-1] and (pixels != 255).any(axis=-1).mean() > 0.2
-    else:
-        text = picture.read_text(encoding="utf-8")
-        assert text.count("<image") == 7  # three slices of each, and the colour bar
-        assert ">reconstruction<" in text and ">3 mm: resolved, valley/peak 0." in text
+def test_the_picture_shows_volume_and_truth(files, tmp_path, command):
+    pictures = [tmp_path / "new" / name for name in ("score.png", "score.svg")]
+    for picture in pictures:
+        words = ["score", files / "volume.nii.gz", "--truth", files / "truth.toml", *PLACE, "--picture", picture]
+        assert command(*words).out.startswith("All voxels: NRMSE 0.")
+    pixels = np.asarray(Image.open(pictures[0]).convert("RGB"))
+    assert pixels.shape[:2] == SIZE[::-1] and (pixels != 255).any(axis=-1).mean() > 0.2
+    text = pictures[1].read_text(encoding="utf-8")
+    assert text.count("<image") == 7  # three slices of each, and the colour bar
+    assert ">reconstruction<" in text and ">3 mm: resolved, valley/peak 0." in text
 
 
-def test_a_run_knows_its_phantom_or_its_volume(files, expected, system, tmp_path, capsys):
+def test_a_run_knows_its_phantom_or_its_volume(files, expected, system, tmp_path, command):
     volume, run = str(files / "volume.nii.gz"), tmp_path / "run.h5"
-    numbers = {
-        "kind": "derenzo",
-        "radius": 24.0,
-        "rod_diameters": RODS,
-        "height": 20.0,
-        "activity": 100.0,
-        "voxels": 24,
-    }
-    numbers |= {"position": (1, 2, 3), "euler_degrees": (0, 20, 0)}
-    recipe = mph.Recipe({f"phantom.{name}": value for name, value in numbers.items()} | {"compute.backend": "numpy"})
+    phantom = {"kind": "derenzo", "radius": 24.0, "rod_diameters": RODS, "height": 20.0, "activity": 100.0}
+    phantom |= {"voxels": 24, "position": (1, 2, 3), "euler_degrees": (0, 20, 0)}
+    recipe = mph.Recipe({f"phantom.{name}": value for name, value in phantom.items()} | {"compute.backend": "numpy"})
     (made,) = mph.run_recipe(recipe.updated({"detector.rows": 4, "detector.columns": 4}), system)
     mph.write_run(made, run)
-    assert main(["score", volume, "--truth", str(run), "--json"]) == 0
-    record = json.loads(capsys.readouterr().out)
-    assert record["derenzo"][0]["valley_to_peak"] == pytest.approx(expected.derenzo[0].valley_to_peak, rel=1e-4)
+    (first, *_) = json.loads(command("score", volume, "--truth", run, "--json").out)["derenzo"]
+    assert first["valley_to_peak"] == pytest.approx(expected.derenzo[0].valley_to_peak, rel=1e-4)
     mph.write_run(dataclasses.replace(made, settings={}), run)
-    assert main(["score", volume, "--truth", str(run), "--json"]) == 0
-    assert "derenzo" not in json.loads(capsys.readouterr().out)
+    assert "derenzo" not in json.loads(command("score", volume, "--truth", run, "--json").out)
     mph.write_run(dataclasses.replace(made, volume=None, unit="counts"), run)
-    assert main(["score", volume, "--truth", str(run)]) == 1
-    assert "run.h5: the run was measured: nobody knows the truth" in capsys.readouterr().err
+    said = command("score", volume, "--truth", run, status=1).err
+    assert "run.h5: the run was measured: nobody knows the truth" in said
 
 
 @pytest.mark.long
-def test_that_a_score_flatters_stays_with_it(system, tmp_path, capsys):
+def test_that_a_score_flatters_stays_with_it(system, tmp_path, command):
     """As JSON, on standard error, and of a reconstruction in its settings and its file."""
     made = {"model.kind": "emission", "model.aperture_points": 7, "model.time": 60.0, "detector.plane": "real",
             "detector.rows": 12, "detector.columns": 12, "phantom.kind": "derenzo", "phantom.voxels": 24,
@@ -184,26 +165,20 @@ def test_that_a_score_flatters_stays_with_it(system, tmp_path, capsys):
     assert [str(each.message) for each in caught] == flatters and len(flatters) == 2
     assert re.search("made from voxels of 4 mm.*3 mm or less", flatters[0]) and "7 points of the hole" in flatters[1]
     mph.write_volume(found.volume, tmp_path / "v.npz")
-    arguments = ["score", str(tmp_path / "v.npz"), "--truth", str(tmp_path / "run.npz")]
-    assert main([*arguments, "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["notes"] == flatters
-    assert main([*arguments, "--picture", str(tmp_path / "p.svg")]) == 0
-    said = capsys.readouterr().err
+    arguments = ["score", tmp_path / "v.npz", "--truth", tmp_path / "run.npz"]
+    assert json.loads(command(*arguments, "--json").out)["notes"] == flatters
+    said = command(*arguments, "--picture", tmp_path / "p.svg").err
     assert all(f"mphdrr: {text}" in said and text in (tmp_path / "p.svg").read_text("utf-8") for text in flatters)
     coarse = mph.Volume(np.ones((12, 12, 12)), mph.Grid.centered(12, 8.0))
     mph.write_volume(coarse, tmp_path / "v.npz")
-    assert main([*arguments, "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["notes"] == flatters[1:]
+    assert json.loads(command(*arguments, "--json").out)["notes"] == flatters[1:]
 
 
-def test_a_truth_volume_on_the_command_line(files, tmp_path, capsys):
-    picture = str(tmp_path / "score.png")
-    names = [str(files / f"{name}.nii.gz") for name in ("volume", "truth")]
-    assert main(["score", names[0], "--truth", names[1], "--picture", picture]) == 0
-    out, err = capsys.readouterr()
-    assert out.startswith("All voxels") and err == (
-        "mphdrr: the truth, on another grid, is resampled onto the volume's voxels, as means\n"
-    )
+def test_a_truth_volume_on_the_command_line(files, tmp_path, command):
+    volume, truth = (files / f"{name}.nii.gz" for name in ("volume", "truth"))
+    out, err = command("score", volume, "--truth", truth, "--picture", tmp_path / "score.png")
+    assert out.startswith("All voxels")
+    assert err == "mphdrr: the truth, on another grid, is resampled onto the volume's voxels, as means\n"
 
 
 @pytest.mark.parametrize(
@@ -211,11 +186,7 @@ def test_a_truth_volume_on_the_command_line(files, tmp_path, capsys):
     [
         ([], 1, "expected --truth FILE or a kind of phantom"),
         (["--truth", "none.nii.gz"], 1, "none.nii.gz: no such file"),
-        (
-            ["--truth", "TRUTH", "--euler", "0", "1", "2"],
-            1,
-            "--euler is for a kind of phantom or a .toml; a run or a v",
-        ),
+        (["--truth", "TRUTH", "--euler", 0, 1, 2], 1, "--euler is for a kind of phantom or a .toml; a run or a v"),
         (["--truth", "TRUTH", *OPTIONS], 1, "expected either --truth or a kind of phantom, got both"),
         (["--truth", "TRUTH", "--picture", "score.pdf"], 1, "score.pdf: expected a name ending in .png, .svg"),
         (["--quantity", "hu", *OPTIONS], 1, "expected a volume of activity or mu, got hu"),
@@ -223,8 +194,7 @@ def test_a_truth_volume_on_the_command_line(files, tmp_path, capsys):
         (["derenzo", "--rods", "x"], 2, "invalid float value: 'x'"),
     ],
 )
-def test_mistakes_are_one_line(files, capsys, arguments, status, message):
-    words = [str(files / "truth.nii.gz") if word == "TRUTH" else word for word in arguments]
-    assert main(["score", str(files / "volume.nii.gz"), *words]) == status
-    err = capsys.readouterr().err
-    assert message in err and err.count("\n") == 1 and err.startswith("mphdrr")
+def test_mistakes_are_one_line(files, command, arguments, status, message):
+    words = [files / "truth.nii.gz" if word == "TRUTH" else word for word in arguments]
+    said = command("score", files / "volume.nii.gz", *words, status=status).err
+    assert message in said and said.count("\n") == 1 and said.startswith("mphdrr")

@@ -68,9 +68,8 @@ def test_the_truth_is_resolved_and_has_all_its_contrast(truth):
 def test_a_uniform_volume_resolves_nothing():
     score = mph.derenzo_score(uniform(3.0, mph.Grid.centered((64, 64, 24), 1.0)), PHANTOM)
     assert score.resolved[:5].tolist() == [0] * 5
-    assert score.valley_to_peak[:5] == pytest.approx(1.0) and score.contrast_recovery[:5] == pytest.approx(
-        0.0, abs=1e-6
-    )
+    assert score.valley_to_peak[:5] == pytest.approx(1.0)
+    assert score.contrast_recovery[:5] == pytest.approx(0.0, abs=1e-6)
 
 
 NARROW = mph.DerenzoPhantom(30.0, (3.5, 6.0, 3.5, 4.5, 3.0, 3.5, 5.0, 3.5, 2.5, 3.5), 16.0, activity=100.0, sectors=10)
@@ -107,19 +106,14 @@ def falsely_resolved(kind: str, volumes: int, grid: mph.Grid, seed: int) -> tupl
     return np.array(found), np.array(small)
 
 
-@pytest.mark.parametrize("kind", list(NOISE)[::4])
-def test_noise_resolves_hardly_any_sector(kind):
-    """25 volumes of a kind; the long lane has 200 of each. One in a thousand may be, by its own chance."""
-    found, _ = falsely_resolved(kind, 25, mph.Grid.centered((31, 31, 9), 2.0), 3)
-    assert len(found) > 100 and found.sum() <= 1
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("kind", NOISE)
-def test_noise_resolves_hardly_any_sector_of_200_volumes(kind):
-    grid = mph.Grid.centered((31, 31, 9), 2.0)
-    found, small = falsely_resolved(kind, 200, grid, 4)
-    assert found.mean() <= 0.004 and found[small].mean() <= 0.008
+@pytest.mark.parametrize(("kind", "volumes"), [
+    *((kind, 25) for kind in list(NOISE)[::4]), *(pytest.param(kind, 200, marks=pytest.mark.long) for kind in NOISE),
+])  # fmt: skip
+def test_noise_resolves_hardly_any_sector(kind, volumes):
+    """One in a thousand may be, by its own chance."""
+    resolved, small = falsely_resolved(kind, volumes, mph.Grid.centered((31, 31, 9), 2.0), 4 if volumes > 25 else 3)
+    assert len(resolved) > 100 and resolved.mean() <= max(0.004, 1 / len(resolved))
+    assert volumes < 200 or resolved[small].mean() <= 0.008
 
 
 def test_pairs_by_themselves_prove_nothing():
@@ -191,9 +185,8 @@ def test_blurred_rods_have_the_valleys_of_theory(sigma):
             start, end = profile.points[[0, -1], :2]
             across = np.array([[0, -1], [1, 0]]) @ (end - start) / np.linalg.norm(end - start)
             aside = np.linspace(-0.25, 0.25, 41)[:, None] * sector.rod_diameter * across  # half a diameter
-            at_start, between, at_end = (
-                blurred_rods(place + aside, sigma).mean() for place in (start, (start + end) / 2, end)
-            )
+            line = (start, (start + end) / 2, end)
+            at_start, between, at_end = (blurred_rods(place + aside, sigma).mean() for place in line)
             peaks.append((at_start + at_end) / 2)
             valleys.append(between)
             assert profile.valley_to_peak == pytest.approx(valleys[-1] / peaks[-1], abs=0.01)
@@ -232,17 +225,14 @@ def test_a_turned_phantom_on_a_straight_grid_is_found(truth):
 def test_cold_rods_have_their_valleys_inside():
     phantom = mph.DerenzoPhantom(30, RODS, 20, 0, cylinder_radius=34, cylinder_height=30, background=7)
     score = mph.derenzo_score(phantom.voxelize(mph.Grid.centered((88, 88, 32), (0.8, 0.8, 1.0))), phantom)
-    assert score.valley_to_peak[:5] == pytest.approx(0, abs=0.01) and score.contrast_recovery[:5] == pytest.approx(
-        1, abs=0.01
-    )
+    assert score.valley_to_peak[:5] == pytest.approx(0, abs=0.01)
+    assert score.contrast_recovery[:5] == pytest.approx(1, abs=0.01)
 
 
 def test_rods_of_any_phantom_are_scored(tmp_path):
     """Such as cold ones of a file, that lie somewhere in its water."""
-    rods = mph.DerenzoRods(
-        radius=30, rod_diameters=RODS, height=20, activity=1, position=(4, -5, 6), euler=(0.2, 0.3, 0)
-    )
-    water = mph.Cylinder(radius=40, height=50, activity=9)
+    place, water = {"position": (4, -5, 6), "euler": (0.2, 0.3, 0)}, mph.Cylinder(radius=40, height=50, activity=9)
+    rods = mph.DerenzoRods(radius=30, rod_diameters=RODS, height=20, activity=1, **place)
     mph.write_phantom(mph.ShapePhantom([water, rods]), tmp_path / "rods.toml")
     phantom = mph.read_phantom(tmp_path / "rods.toml")
     score = mph.derenzo_score(phantom.voxelize(mph.Grid.centered((85, 85, 55), 1.0)), phantom)
@@ -258,9 +248,8 @@ def test_what_cannot_be_scored_is_nan_and_says_why(truth):
     notes = [sector.note for sector in mph.derenzo_score(cut, PHANTOM)]
     assert notes[0] == "" and notes[3] == "the volume covers 0 of 6 rods"
     single = mph.DerenzoPhantom(17.0, (6, 0, 0, 0, 0, 2), 10.0)
-    assert (
-        mph.derenzo_score(uniform(1.0, mph.Grid.centered(36, 1.0)), single)[0].note == "a single rod has no neighbour"
-    )
+    (score, *_) = mph.derenzo_score(uniform(1.0, mph.Grid.centered(36, 1.0)), single)
+    assert score.note == "a single rod has no neighbour"
     even = mph.Volume(truth.array, truth.grid, "mu")
     in_water = mph.DerenzoPhantom(30.0, RODS, 20.0, cylinder_radius=30)
     assert mph.derenzo_score(even, in_water)[0].note == "the rods hold the same mu as what is between them"
@@ -288,14 +277,11 @@ def test_where_the_volume_covers_a_part_of_the_rods_that_part_is_scored(low, hig
             assert np.isnan(sector.resolved) and sector.words == f"the volume covers {covered:.3g} of 20 mm"
 
 
-@pytest.mark.parametrize(
-    ("center", "thickness", "said"), [(0, 1.0, "1"), (9.5, 3.0, "2"), (30, 2.0, "0"), (-10, 2.0, "1")]
-)
+@pytest.mark.parametrize(("center", "thickness", "said"), [(0, 1, "1"), (9.5, 3, "2"), (30, 2, "0"), (-10, 2, "1")])
 def test_a_slab_too_thin_says_what_it_covers(center, thickness, said):
     slab = uniform(1.0, mph.Grid.centered((60, 60, 1), (1.0, 1.0, thickness), center=(0, 0, center)))
-    assert [sector.note for sector in mph.derenzo_score(slab, PHANTOM)[:5]] == [
-        f"the volume covers {said} of 20 mm"
-    ] * 5
+    notes = [sector.note for sector in mph.derenzo_score(slab, PHANTOM)[:5]]
+    assert notes == [f"the volume covers {said} of 20 mm"] * 5
     thick = uniform(1.0, mph.Grid.centered((60, 60, 1), (1.0, 1.0, 8.0)))  # one voxel along the rods
     assert mph.derenzo_score(thick, PHANTOM)[0].valley_to_peak == pytest.approx(1.0)
 
@@ -317,8 +303,8 @@ def test_the_middle_half_counts_where_it_is_covered():
 def test_derenzo_score_refuses_what_it_cannot_take(truth):
     refused(lambda: mph.derenzo_score(truth.array, PHANTOM), "derenzo_score: expected a Volume, got ndarray")
     refused(lambda: mph.derenzo_score(truth, mph.NemaBody()), "with Derenzo rods, got a NEMA body phantom without")
-    with pytest.raises(mph.InputError, match="derenzo_score: expected a volume of activity or mu, got hu"):
-        mph.derenzo_score(mph.Volume(truth.array, truth.grid, "hu"), PHANTOM)
+    hu = mph.Volume(truth.array, truth.grid, "hu")
+    refused(lambda: mph.derenzo_score(hu, PHANTOM), "derenzo_score: expected a volume of activity or mu, got hu")
     refused(lambda: mph.derenzo_score(truth, PHANTOM, np.zeros((4, 4))), "phantom pose")
 
 
@@ -332,16 +318,9 @@ def pair(rng) -> tuple[mph.Volume, mph.Volume]:
     return mph.Volume(values + 0.5 * rng.standard_normal(GRID.shape), GRID), mph.Volume(values, GRID)
 
 
-def test_scores_of_the_truth_itself(pair):
-    _, truth = pair
-    assert mph.nrmse(truth, truth) == 0
-    assert mph.psnr(truth, truth) == np.inf
-    assert mph.ssim(truth, truth) == pytest.approx(1.0, abs=1e-12)
-    assert mph.nrmse(uniform(0, GRID), truth) == 1
-
-
 def test_errors_are_those_of_the_definitions(pair):
     volume, truth = pair
+    assert (mph.nrmse(truth, truth), mph.psnr(truth, truth), mph.nrmse(uniform(0, GRID), truth)) == (0, np.inf, 1)
     error = volume.array.astype(float) - truth.array
     assert mph.nrmse(volume, truth) == pytest.approx(np.linalg.norm(error) / np.linalg.norm(truth.array), rel=1e-6)
     span = np.ptp(truth.array)
@@ -366,7 +345,7 @@ def ssim_by_scipy(x: np.ndarray, y: np.ndarray, span: float) -> float:
 
 def test_ssim_is_that_of_other_programs(pair):
     x, y = (volume.array.astype(float) for volume in pair)
-    assert 0.2 < mph.ssim(*pair) < 0.98
+    assert 0.2 < mph.ssim(*pair) < 0.98 and mph.ssim(pair[1], pair[1]) == pytest.approx(1.0, abs=1e-12)
     assert mph.ssim(*pair) == pytest.approx(ssim_by_scipy(x, y, np.ptp(y)), abs=1e-9)
     assert mph.ssim(x, y, data_range=50) == pytest.approx(mph.ssim(y, x, data_range=50), abs=1e-12)
     # A slice has one of two dimensions.
@@ -417,8 +396,8 @@ def test_bias_and_deviation_make_the_error(pair, rng):
     assert np.allclose(bias.array**2 + 11 / 12 * deviation.array**2, squares, atol=1e-4)
     assert deviation.array.mean() == pytest.approx(0.3, rel=0.05) and bias.unit == "kBq/mL"
     refused(lambda: mph.bias_and_deviation(draws[:1], truth), "expected two volumes or more, got 1")
-    with pytest.raises(mph.InputError, match="volume 2: volume and truth are on different grids"):
-        mph.bias_and_deviation([truth, uniform(1, mph.Grid.centered(8, 1))], truth)
+    volumes = [truth, uniform(1, mph.Grid.centered(8, 1))]
+    refused(lambda: mph.bias_and_deviation(volumes, truth), "volume 2: volume and truth are on different grids")
 
 
 @pytest.mark.parametrize(

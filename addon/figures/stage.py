@@ -93,8 +93,8 @@ class FigureScene:
     def show(self, turn: float, lit: list[int], rays: list[int]) -> None:
         """Show a moment of the animation: the camera's place, lit modules, rays, and faded modules in the camera's way.
 
-        `turn` is the camera's angle around z, rad. `lit` and `rays` are numbers of modules: of those that are lit, and of those
-        with rays.
+        `turn` is the camera's angle around z, rad; `lit` and `rays` are the numbers of modules that are lit, or whose rays
+        are shown.
         """
         cos, sin = np.cos(turn), np.sin(turn)
         direction = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]]) @ DIRECTION

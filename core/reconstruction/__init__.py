@@ -7,12 +7,8 @@
 
 To add a method, write its function in a module here and add a row to `METHODS`. Its iterations are a `Loop` (loop.py,
 with what all iterative methods take, `IterativeOptions`), for counts a `CountLoop` (counts.py), for least squares a
-`LeastSquaresLoop` (least_squares.py). To add a prior, derive a class from `Prior` in priors.py (`_psi`, `_first_derivatives`,
-`_second_derivatives`) and add a row to `PRIORS` there. The arguments of both are settings, with their defaults: an argument with a new
-name is declared by the decorator `arguments.argument`, which has its type, text and limits. Command line, recipe and
-panel follow. Add a public name to `core/__init__.py`.
-
-To add a kind of file that is a method, such as another library's network, add its ending and a function that reads it as
-a `Method` to `core/method_files.py`; the function imports its library when it is called. To add a rule that ends
-iterations, derive a class from `StoppingRule` (stopping.py).
+`LeastSquaresLoop` (least_squares.py). To add a prior, derive a class from `Prior` in priors.py (`_psi`,
+`_first_derivatives`, `_second_derivatives`) and add a row to `PRIORS` there. The arguments of both are settings, with their
+defaults: an argument with a new name is declared by the decorator `arguments.argument`, which has its type, text and limits.
+Command line, recipe and panel follow. Add a public name to `core/__init__.py`.
 """

@@ -25,31 +25,31 @@ bpy.context.preferences.view.show_splash = False
 
 
 def ours(name: str) -> ModuleType:
-    """A module of the extension, such as ``"addon.runs.runs"``."""
+    """Return a module of the extension, such as ``"addon.runs.runs"``."""
     return import_module(f"bl_ext.user_default.mphdrr.{name}")
 
 
 def editor(kind: str = "VIEW_3D"):
-    """Window, area and region of the largest editor of a kind."""
+    """Return window, area and region of the largest editor of a kind."""
     window = bpy.context.window_manager.windows[0]
     area = max((a for a in window.screen.areas if a.type == kind), key=lambda a: a.width * a.height)
     return window, area, next(r for r in area.regions if r.type == "WINDOW")
 
 
 def within(kind: str = "VIEW_3D"):
-    """The context of that editor."""
+    """Return a context manager for the context of the largest editor of a kind."""
     window, area, region = editor(kind)
     return bpy.context.temp_override(window=window, area=area, region=region)
 
 
 def press(operator: Callable, how: str = "INVOKE_DEFAULT", kind: str = "VIEW_3D", **settings: object) -> set[str]:
-    """Call an operator as a button of that editor's sidebar does; INVOKE_DEFAULT starts a job."""
+    """Call an operator as a button of an editor's sidebar does; INVOKE_DEFAULT starts a job."""
     with within(kind):
         return operator(how, True, **settings)
 
 
 def sidebar(kind: str = "VIEW_3D"):
-    """The sidebar's region."""
+    """Return the region of an editor's sidebar."""
     return next(region for region in editor(kind)[1].regions if region.type == "UI")
 
 
@@ -59,13 +59,13 @@ def open_tab(kind: str = "VIEW_3D") -> None:
 
 
 def panels() -> list:
-    """Our panels' classes, each after the one that it is in."""
+    """Return our panels' classes, each after the one that it is in."""
     found = [getattr(bpy.types, name) for name in dir(bpy.types) if name.startswith("MPHDRR_PT_")]
     return sorted(found, key=lambda cls: hasattr(cls, "bl_parent_id"))
 
 
 def only(*names: str) -> None:
-    """Only these panels are there, open, so that all of them is on the screen."""
+    """Remove all panels but these, and open these, so that all of them is on the screen."""
     for cls in reversed(panels()):
         if cls.__name__ not in names and "INSTANCED" not in getattr(cls, "bl_options", ()):
             bpy.utils.unregister_class(cls)
@@ -85,17 +85,17 @@ def opened(*names: str, but_closed: tuple[str, ...] = ()) -> None:
 
 
 def xdotool(*what: object) -> None:
-    """Mouse and keyboard."""
+    """Move the mouse or type, by xdotool's command line."""
     subprocess.run(["xdotool", *map(str, what)], check=True)
 
 
 def proposed() -> str:
-    """What the button at the top of the tab says."""
+    """Return the text of the button at the top of the tab."""
     return ours("addon.next_step").next_step(bpy.context).text
 
 
 def click_proposed(first: int = 44) -> None:
-    """Click on that button; `first` is how far below the sidebar's top, in pixels, that of an empty scene is."""
+    """Click on the button at the tab's top; `first`: pixels from the sidebar's top to that button in an empty scene."""
     region, window = sidebar(), editor()[0]
     down = first if proposed() == "Load Example" else 160
     xdotool("mousemove", round(region.x + 0.4 * region.width), window.height - region.y - region.height + down)
@@ -103,19 +103,19 @@ def click_proposed(first: int = 44) -> None:
 
 
 def on_screen(x: float, y: float, kind: str = "VIEW_3D") -> tuple[int, int]:
-    """Where on the screen a place of an editor's region is."""
+    """Return the position on the screen of a place of an editor's region."""
     window, _, region = editor(kind)
     return round(region.x + x), round(window.height - 1 - region.y - y)
 
 
 def frame(kind: str = "VIEW_3D") -> list[int]:
-    """Left, top, right and bottom of an editor's region on the screen."""
+    """Return left, top, right and bottom of an editor's region on the screen."""
     region = editor(kind)[2]
     return [*on_screen(0, region.height, kind), *on_screen(region.width, 0, kind)]
 
 
 def place(point) -> tuple[int, int]:
-    """Where on the screen a place in the world is, in the 3D view."""
+    """Return the position on the screen of a place in the world, in the 3D view."""
     region = editor()[2]
     return on_screen(*location_3d_to_region_2d(region, region.data, point))
 
@@ -143,24 +143,24 @@ def picture(name: str) -> Path:
 
 
 def empty_scene() -> None:
-    """Without the objects of the start-up file."""
+    """Remove the objects of the start-up file."""
     for name in ("Cube", "Light", "Camera"):
         bpy.data.objects.remove(bpy.data.objects[name])
 
 
 def scanner():
-    """The first scanner's collection."""
+    """Return the first scanner's collection."""
     return next(c for c in bpy.data.collections if c.mphdrr_scanner.is_scanner)
 
 
 def module(number: int, within=None):
-    """The camera of a module, of the first scanner or the one given."""
+    """Return the camera of a module, of the first scanner or of the one in `within`."""
     items = (within or scanner()).all_objects
     return next(o for o in items if o.mphdrr_module.is_module and o.mphdrr_module.number == number)
 
 
 def is_idle() -> bool:
-    """Whether no job is running."""
+    """Return whether no job is running."""
     has_modal = len(bpy.context.window_manager.windows[0].modal_operators) > 0
     return not has_modal and not ours("addon.blender.jobs").is_running()
 
@@ -173,7 +173,7 @@ def idle() -> Iterator[float]:
 
 
 def escape_asks() -> Iterator[float]:
-    """Escape asks whether to keep or to discard what the job has made, and it goes on; the question is closed unanswered."""
+    """Press Escape, which asks whether to keep the job's result while the job goes on; close the question unanswered."""
     keys("Escape")
     yield 1.0
     seen["asked"] = ours("addon.blender.jobs").is_running()
@@ -193,7 +193,7 @@ beats: list[float] = []
 
 
 def own_time() -> float:
-    """Seconds, without those in which this thread could run but other work had the processor (Linux counts them)."""
+    """Return the time, s, without that in which this thread could run but had no processor (Linux counts it)."""
     try:
         waited = int(Path("/proc/thread-self/schedstat").read_text().split()[1])
     except OSError:
@@ -202,7 +202,7 @@ def own_time() -> float:
 
 
 def beat() -> float:
-    """A timer whose pauses are measured; it also notes the words of jobs."""
+    """Note the time, as a timer whose pauses are measured, and the words of the running job."""
     beats.append(own_time())
     current = ours("addon.blender.jobs")._current
     if current is not None and current.text not in seen["words"]:
@@ -211,12 +211,12 @@ def beat() -> float:
 
 
 def longest_pause() -> float:
-    """The longest pause between two beats, s."""
+    """Return the longest pause between two beats, s."""
     return max(b - a for a, b in itertools.pairwise(beats))
 
 
 def pause_beyond_redraw() -> Iterator[float]:
-    """Yields seconds to wait; returns the longest pause since the beats were cleared, without what a redraw takes."""
+    """Yield seconds to wait; return the longest pause since the beats were cleared, less that of a redraw."""
     during = longest_pause()
     beats.clear()
     yield from drawn(3)

@@ -17,7 +17,7 @@ _SHOWN = 0.5  # s until the screen has what the script has drawn at last
 
 
 def is_done(folder: Path) -> bool:
-    """Whether the script says that it has ended."""
+    """Return whether the script says that it has ended."""
     for path in folder.rglob("*.json"):
         try:
             said = json.loads(path.read_text())
@@ -29,7 +29,7 @@ def is_done(folder: Path) -> bool:
 
 
 def main(picture: str, script: str, seconds: str, folder: str, *arguments: str) -> None:
-    """Do so."""
+    """Run a script in Blender's window, on a screen of its own."""
     width, height = SCREEN
     reading, writing = os.pipe()
     screen = subprocess.Popen(

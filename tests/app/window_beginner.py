@@ -12,7 +12,7 @@ _MOST = 6
 
 
 def clicks(name: str) -> Iterator[float]:
-    """Click until a score stands; yields what to wait for."""
+    """Click until a score stands; yield what to wait for."""
     scene, seen[name] = bpy.context.scene, []
     scene.mphdrr_reconstruction.voxels, scene.mphdrr_reconstruction.iterations = 32, 4  # for speed
     while not scene.mphdrr_reconstruction.details.get("scores") and len(seen[name]) < _MOST:
@@ -25,7 +25,7 @@ def clicks(name: str) -> Iterator[float]:
 
 
 def steps():
-    """Yields seconds to wait, or a function that says when it has happened."""
+    """Yield seconds to wait, or a function that says when it has happened."""
     editor()[1].spaces.active.show_region_ui = True
     yield 1
     open_tab()

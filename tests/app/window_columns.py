@@ -17,7 +17,7 @@ def scanners():
 
 
 def steps():
-    """Yields what to wait for: seconds, or a function that says when it has happened."""
+    """Yield what to wait for: seconds, or a function that says when it has happened."""
     region = editor()[2]
     xdotool("mousemove", *on_screen(region.width // 2, region.height // 2))
     yield 1

@@ -51,7 +51,7 @@ def meshes() -> int:
 
 
 def moved(number: int, by: tuple[float, float, float]):
-    """Whether a module has come to `by` from where it was at first, and its readouts with it."""
+    """Return a function: whether a module has moved by `by` from where it was at first, and its readouts with it."""
     start = seen["before"]["place"]
 
     def is_there() -> bool:
@@ -63,7 +63,7 @@ def moved(number: int, by: tuple[float, float, float]):
 
 
 def steps():
-    """Yields what to wait for: seconds, or a function that says when it has happened."""
+    """Yield what to wait for: seconds, or a function that says when it has happened."""
     empty_scene()
     bpy.ops.mphdrr.import_geometry("EXEC_DEFAULT", True, filepath=str(WORKBOOK))
     show()
@@ -123,7 +123,7 @@ def steps():
 
 
 def show() -> None:
-    """The scanner, and the Design panels open."""
+    """Show the scanner, and open the Design panels."""
     opened("MPHDRR_PT_design")
     space = editor()[1].spaces.active
     space.show_region_ui = True

@@ -30,7 +30,7 @@ BLUE = np.array([0x47, 0x72, 0xB3])  # of Blender's sliders
 
 
 def place_of(number: int, pixel: tuple[float, float]) -> tuple[int, int]:
-    """Where on the screen a module's tile has a pixel."""
+    """Return the position on the screen of a pixel of a module's tile."""
     _, area, region = editor("IMAGE_EDITOR")
     image = area.spaces.active.image
     (tile,) = (each for each in tiles.shown_pictures(image) if each.number == number)
@@ -39,7 +39,7 @@ def place_of(number: int, pixel: tuple[float, float]) -> tuple[int, int]:
 
 
 def slider() -> tuple[int, int]:
-    """A place in the filled part of the slider in the Image Editor's sidebar, which is the widest blue there."""
+    """Return a place in the filled part of the slider in the Image Editor's sidebar, the widest blue there."""
     window, area, _ = editor("IMAGE_EDITOR")
     sidebar = next(region for region in area.regions if region.type == "UI")
     shot = bpy.data.images.load(str(picture("slider")))
@@ -56,13 +56,13 @@ def slider() -> tuple[int, int]:
 
 
 def pixel() -> list[float]:
-    """The number of the module and its pixel that are picked."""
+    """Return the picked pixel after the number of its module."""
     found = epipolar.picked_pixel(bpy.context.scene)
     return [found.run.numbers[found.index], *found.pixel.tolist()]
 
 
 def steps():
-    """Yields seconds to wait."""
+    """Yield seconds to wait."""
     opened("MPHDRR_PT_epipolar_of_images", but_closed=("MPHDRR_PT_display_of_images", "MPHDRR_PT_runs_of_images"))
     press(bpy.ops.mphdrr.load_example)
     yield from idle()

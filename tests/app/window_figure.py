@@ -9,7 +9,7 @@ from driving import WORKBOOK, drawn, editor, escape_asks, folder, idle, is_idle,
 
 
 def steps():
-    """Yields seconds to wait."""
+    """Yield seconds to wait."""
     shown_in = bpy.context.preferences.view.render_display_type
     bpy.ops.mphdrr.import_geometry(filepath=str(WORKBOOK))
     bpy.ops.mphdrr.add_derenzo(voxels=48)

@@ -7,7 +7,7 @@ MODULE = 27
 
 
 def steps():
-    """Yields seconds to wait."""
+    """Yield seconds to wait."""
     for name in ("Cube", "Light", "Camera"):
         bpy.data.objects[name].hide_set(True)
     space = editor()[1].spaces.active

@@ -48,7 +48,7 @@ def measured(name: str, operator, **settings):
 
 
 def state() -> dict[str, object]:
-    """Names, users, custom properties and pixels of the file's data, and the run file."""
+    """Return names, users, custom properties and pixels of the file's data, and the run file."""
     found: dict[str, object] = {}
     for kind in ("objects", "images", "collections", "cameras", "meshes", "materials", "volumes", "texts"):
         for item in getattr(bpy.data, kind):
@@ -64,7 +64,7 @@ def state() -> dict[str, object]:
 
 
 def cancelled(stage: str, operator, **settings):
-    """Cancel a job in a stage; what is in the file is as before."""
+    """Cancel a job in a stage, and note what differs in the file from before."""
     before = state()
     start(operator, **settings)
     while jobs._current is not None and jobs._current.stage != stage:

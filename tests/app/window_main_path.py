@@ -8,7 +8,7 @@ from mathutils import Euler
 
 
 def steps():
-    """Yields seconds to wait."""
+    """Yield seconds to wait."""
     empty_scene()
     bpy.ops.mphdrr.import_geometry(filepath=str(WORKBOOK))
     press(bpy.ops.mphdrr.add_derenzo, "EXEC_DEFAULT", voxels=128, theta=math.radians(55), phi=math.radians(30))

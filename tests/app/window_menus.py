@@ -17,7 +17,7 @@ def model() -> str:
 
 
 def steps():
-    """Yields how many seconds Blender may take before the next step."""
+    """Yield the seconds that Blender may take before the next step."""
     bpy.ops.mphdrr.import_geometry(filepath=str(WORKBOOK))
     camera = bpy.data.objects["Module 05"]
     camera.rotation_euler.x += 0.2

@@ -5,7 +5,7 @@ from driving import drawn, editor, idle, open_tab, opened, panels, picture, pres
 
 
 def steps():
-    """Yields seconds to wait."""
+    """Yield seconds to wait."""
     press(bpy.ops.mphdrr.load_example, "EXEC_DEFAULT")
     settings = bpy.context.scene.mphdrr_reconstruction
     settings.voxels, settings.iterations = 48, 2

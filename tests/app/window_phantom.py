@@ -29,7 +29,7 @@ def has_length(length: float):
 
 
 def steps():
-    """Yields what to wait for: seconds, or a function that says when it has happened."""
+    """Yield what to wait for: seconds, or a function that says when it has happened."""
     empty_scene()
     area = editor()[1]
     area.spaces.active.show_region_ui = True

@@ -11,7 +11,7 @@ MOVES = 50
 
 
 def timed(function):
-    """The function, its time added to that of the move."""
+    """Wrap a function so that its time is added to that of the move."""
 
     def run(*arguments):
         started = own_time()
@@ -51,7 +51,7 @@ def figures(name, times):
 
 
 def at_rest() -> bool:
-    """Whether the preview has all pixels of what there is."""
+    """Return whether the preview has all pixels of what there is."""
     shown = preview.session().preview
     return shown is not None and not shown.is_quick
 

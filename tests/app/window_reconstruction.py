@@ -7,7 +7,7 @@ seen |= {"iterations": []}
 
 
 def steps():
-    """Yields seconds to wait."""
+    """Yield seconds to wait."""
     editor()[1].spaces.active.show_region_ui = True
     press(bpy.ops.mphdrr.import_geometry, "EXEC_DEFAULT", filepath=str(WORKBOOK))
     press(bpy.ops.mphdrr.add_derenzo, "EXEC_DEFAULT", voxels=48)

@@ -7,7 +7,7 @@ runs = ours("addon.runs.runs")
 
 
 def move() -> None:
-    """With the tool, 1 mm up: an undo step."""
+    """Move the active object by 1 mm up with Blender's tool, which makes an undo step."""
     for item in bpy.context.selected_objects:
         item.select_set(False)
     camera = bpy.data.objects["Module 30"]
@@ -21,7 +21,7 @@ def changes(when: str) -> None:
 
 
 def steps():
-    """Yields seconds to wait."""
+    """Yield seconds to wait."""
     editor()[1].spaces.active.show_region_ui = True
     press(bpy.ops.mphdrr.load_example)
     yield from idle()

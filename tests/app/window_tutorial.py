@@ -37,7 +37,7 @@ def mouse(x: float, y: float, *buttons: int) -> None:
 
 
 def scroll(down: int):
-    """Turn the wheel over the sidebar, down, or up where negative; yields what to wait for."""
+    """Turn the wheel over the sidebar, down, or up where negative; yield what to wait for."""
     region = sidebar()
     top = region.view2d.region_to_view(0, 0)[1]
     middle = editor()[0].height - region.y - region.height / 2
@@ -47,7 +47,7 @@ def scroll(down: int):
 
 
 def totals() -> dict[int, float]:
-    """The sum of each module's image, from the exact images in the .blend."""
+    """Return the sum of each module's image, from the exact images in the .blend."""
     images = {i.name: i for i in bpy.data.images}
     return {n: float(np.asarray(images[f"mphDRR {n:02d}"].pixels[:])[::4].sum()) for n in (54, 55)}
 

@@ -21,7 +21,7 @@ from driving import (
 
 
 def steps():
-    """Yields seconds to wait."""
+    """Yield seconds to wait."""
     color_bar, slices = ours("addon.perspective.color_bar"), ours("addon.volumes.slices")
     for name in ("Cube", "Light", "Camera"):
         bpy.data.objects[name].hide_set(True)

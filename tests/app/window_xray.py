@@ -7,7 +7,7 @@ _FIRST = 78  # pixels from the sidebar's top to the button of the X-ray example
 
 
 def steps():
-    """Yields seconds to wait, or a function that says when it has happened."""
+    """Yield seconds to wait, or a function that says when it has happened."""
     editor()[1].spaces.active.show_region_ui = True
     yield 1
     open_tab()

@@ -68,7 +68,7 @@ test = 0.5
 
 @pytest.fixture
 def recipe(scene, tmp_path) -> events.EventRecipe:
-    """The recipe above, chosen in the panel with a folder for its set."""
+    """Return the recipe `TEXT`, chosen in the panel with a folder for its set."""
     path = tmp_path / "small.toml"
     path.write_text(TEXT)
     settings = scene.mphdrr_events
@@ -77,7 +77,7 @@ def recipe(scene, tmp_path) -> events.EventRecipe:
 
 
 def first_of(recipe: events.EventRecipe, name: str, mirrored: bool | None = None) -> events.PlannedEvent:
-    """The first event of a phantom."""
+    """Return the first event of a phantom."""
     planned = (events.plan(recipe, number) for number in range(99))
     return next(event for event in planned if event.name == name and mirrored in (None, event.mirror))
 
@@ -142,7 +142,7 @@ def test_its_attenuation_and_outline_go_with_it(recipe, scene):
 
 
 def with_phantom(path: Path, entry: str) -> str:
-    """The recipe with this one phantom, in a file."""
+    """Write the recipe with this one phantom into a file, and return its path."""
     head, tail = TEXT.split("[[phantoms]]", 1)[0], TEXT[TEXT.index("[models.lines]") :]
     path.write_text(f"{head}[[phantoms]]\n{entry}\n{tail}")
     return str(path)

@@ -254,7 +254,7 @@ def test_sequence_of_what_cannot_follow_is_refused(ct):
 
 @pytest.fixture
 def two_states() -> list[Volume]:
-    """Two states of random voxels."""
+    """Return two states of random voxels."""
     arrays = np.random.default_rng(5).random((2, 9, 8, 7), np.float32)
     return [Volume(array, Grid.centered(array.shape, 10.0)) for array in arrays]
 
@@ -298,7 +298,7 @@ def test_the_current_frame_is_projected(scene, ring, ring_system, two_states):
 
 @pytest.fixture
 def halves(tmp_path) -> list[dict[str, str]]:
-    """Files whose voxels are bright at low, then at high x, both beside the isocentre; named as numbers sort."""
+    """Write files with voxels bright at low, then at high x, both beside the isocentre; their names sort as numbers do."""
     names = []
     for number, half in ((9, slice(0, 4)), (10, slice(4, 8))):
         array = np.zeros((8, 8, 8), np.float32)

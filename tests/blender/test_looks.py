@@ -31,7 +31,7 @@ def nema(scene):
 
 
 def surface(item) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices (n, 3) in the object's space and edges (m, 2) of the surface that Blender draws."""
+    """Return vertices (n, 3) in the object's space and edges (m, 2) of the surface that Blender draws."""
     made = looks.surface_of(item)
     update()
     mesh = made.evaluated_get(bpy.context.evaluated_depsgraph_get()).data

@@ -65,7 +65,7 @@ def found(recipe):
 
 @pytest.fixture
 def at_once(monkeypatch, found):
-    """Searches that find it at once."""
+    """Replace the search by one that returns `found` at once."""
 
     def optimize(recipe, progress, callback):
         callback(found.start, 0.0)
@@ -76,7 +76,7 @@ def at_once(monkeypatch, found):
 
 @pytest.fixture
 def like(found):
-    """A scanner with modules of the same numbers, from a workbook."""
+    """Return a scanner with modules of the same numbers, as from a workbook."""
     return found.start.replace(pinhole_diameter=np.full(6, 3.3), roi_radius=np.full(6, 20.0))
 
 
@@ -116,7 +116,7 @@ def test_one_of_other_modules_stays_beside_it(scene, recipe, found, at_once, rin
 
 
 def moved(scene, recipe, looks: int) -> tuple[jobs.Job, list[mph.PinholeSystem]]:
-    """A job whose search is shown so many times, and the scanners that were seen."""
+    """Run a job whose search is shown so many times and then cancelled; return it and the scanners that were seen."""
     job, seen = optimising.optimize_job(scene, recipe), []
 
     def work(done, total):

@@ -119,7 +119,7 @@ def names(collection) -> list[tuple[str, str]]:
 
 
 def assert_whole(collection, numbers) -> None:
-    """Every module has its number, and its parts and all names agree."""
+    """Check that every module has its number, and that its parts and all names agree."""
     found = scanner.modules(collection)
     assert [camera.mphdrr_module.number for camera in found] == list(numbers)
     assert [camera.name for camera in found] == [f"Module {n:02d}" for n in numbers]

@@ -19,14 +19,14 @@ from .conftest import assert_same, cycles_picture, move, reopened, turn, update
 
 
 def project(views: Views, points: np.ndarray) -> np.ndarray:
-    """(M, N, 2) columns and rows of world points (N, 3)."""
+    """Return columns and rows (M, N, 2) of world points (N, 3)."""
     homogeneous = np.concatenate([points, np.ones((len(points), 1))], axis=1)
     image = np.einsum("mij,nj->mni", views.projection_matrices(), homogeneous)
     return image[..., :2] / image[..., 2:]
 
 
 def blender_pixels(scene, camera, points: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
-    """(N, 2) columns and rows by Blender; its x grows to the right, which is -u."""
+    """Return columns and rows (N, 2) by Blender; its x grows to the right, which is -u."""
     n_v, n_u = shape
     seen = np.array([world_to_camera_view(scene, camera, Vector(p))[:] for p in points])
     return np.stack([(1 - seen[:, 0]) * n_u - 0.5, seen[:, 1] * n_v - 0.5], axis=1)
@@ -99,7 +99,7 @@ def add_emitting_sphere(center: np.ndarray, radius: float, channel: int) -> None
 
 @pytest.fixture
 def tilted(ring_system) -> PinholeSystem:
-    """Modules tilted by up to 3 degrees; one is not."""
+    """Return modules tilted by up to 3 degrees; one is not."""
     rng = np.random.default_rng(5)
     vectors = rng.normal(size=(8, 3))
     vectors *= np.radians(rng.uniform(0.5, 3.0, 8))[:, None] / np.linalg.norm(vectors, axis=1)[:, None]

@@ -21,9 +21,10 @@ from mphdrr.core.errors import InputError, InputWarning
 from mphdrr.core.geometry.pinhole_columns import PINHOLE_COLUMNS
 from mphdrr.core.workbook.headings import Heading, get_vocabulary
 
-from .test_workbook import CENTERS, _unnumbered, assert_plain, plain, read_edited, saved
+from .nasty.layouts import CENTERS
 from .test_workbook import _typed as typed
-from .workbooks import DIMENSIONS, by_design
+from .test_workbook import _unnumbered, assert_plain, read_edited, saved
+from .workbooks import DIMENSIONS, by_design, plain
 
 pytestmark = pytest.mark.filterwarnings("error")
 

@@ -631,10 +631,7 @@ def test_file_of_absurd_size_is_refused_unread(workbook, tmp_path, monkeypatch):
 def test_a_sheet_of_300_mb_of_blanks_is_refused_without_unpacking_it(workbook, tmp_path):
     """Also where the archive lies about the size."""
     name, bomb = "xl/worksheets/sheet1.xml", tmp_path / "bomb.xlsx"
-    with (
-        zipfile.ZipFile(workbook) as old,
-        zipfile.ZipFile(bomb, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as new,
-    ):
+    with zipfile.ZipFile(workbook) as old, zipfile.ZipFile(bomb, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as new:
         for info in old.infolist():
             with new.open(info.filename, "w") as part:
                 before, data, after = old.read(info).partition(b"<sheetData>")

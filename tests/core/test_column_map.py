@@ -18,8 +18,8 @@ from mphdrr.core.errors import InputError
 
 from .nasty.case import read
 from .test_workbook import _typed as typed
-from .test_workbook import assert_plain, plain, saved
-from .workbooks import DIMENSIONS, by_design
+from .test_workbook import assert_plain, saved
+from .workbooks import DIMENSIONS, by_design, plain
 
 pytestmark = pytest.mark.filterwarnings("error")
 

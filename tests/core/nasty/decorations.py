@@ -11,16 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from openpyxl.utils import column_index_from_string, get_column_letter
 
-from .layouts import (
-    DESCRIPTIONS,
-    MILLIMETRES,
-    POSITION,
-    SYMBOLS,
-    TYPED,
-    Draft,
-    Table,
-    formulas_of,
-)
+from .layouts import DESCRIPTIONS, MILLIMETRES, POSITION, SYMBOLS, TYPED, Draft, Table, formulas_of
 from .sheets import Error, Formula, Raw, Rich, Sheet, split
 
 

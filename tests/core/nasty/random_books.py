@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 
 from .decorations import ELEMENTS, Element
 from .layouts import OTHER_HEADINGS, PLAIN_FORMS, TYPED, USERS, Draft, Layout, formulas_of, laid_out
-from .sheets import Formula, by_hand, by_openpyxl, by_xlsxwriter
+from .sheets import Formula, by_hand, by_xlsxwriter, openpyxl_workbook
 
 SHEETS = [("Coordinates", "Main"), ("Geometry", "Sheet2"), ("Lage", "Größen"), (" Main ", "COORDINATES")]
 SHEETS += [("a'b", "c d"), ("a" * 31, "b" * 31), ("Main", "Coordinates")]
@@ -83,7 +83,7 @@ def written(recipe: Recipe, path: Path) -> Draft:
         draft.plain &= not any("form" in kind or kind == "unstored" for kind in draft.layout.labels)
         return draft
     if program == "openpyxl":
-        by_openpyxl(draft.book, path)
+        openpyxl_workbook(draft.book).save(path)
         return draft
     by_hand(draft.book, path)
     if program.endswith("values alone") and not {draft.layout.formulas, *draft.layout.labels} & {"unstored", "zeros"}:

@@ -51,7 +51,7 @@ Td = { column = "E", unit = "mm" }
 
 
 def silent(folder: Path, edit: Callable | None = None) -> Path:
-    """The plain workbook with typed numbers and headings that the reader does not understand, edited further."""
+    """Return the plain workbook with typed numbers and headings that the reader does not understand, edited further."""
     book = plain()
     typed(book["Main"], book["Coordinates"])
     for sheet in book.worksheets:

@@ -44,7 +44,7 @@ def saved(book: Workbook, folder: Path, name: str = "scanner.xlsx") -> Path:
 
 
 def read_edited(folder: Path, edit: Callable[[Worksheet, Worksheet], object]):
-    """The system read from the plain workbook after `edit(main, coordinates)`."""
+    """Return the system read from the plain workbook after `edit(main, coordinates)`."""
     book = plain()
     edit(book["Main"], book["Coordinates"])
     return read_system(saved(book, folder))

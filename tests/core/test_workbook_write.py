@@ -58,7 +58,7 @@ def assert_same(back: mph.PinholeSystem, system: mph.PinholeSystem, numbered: bo
 
 
 def write_changed(folder, layout: TemplateLayout, seed: int):
-    """A template of the layout, a change of its system, and the written result."""
+    """Return a template of the layout, a change of its system, and the written result."""
     template = folder / "template.xlsx"
     template.write_bytes(content_of(template_workbook(layout)))
     system = random_change(np.random.default_rng(seed), read_quietly(template), layout)
@@ -85,7 +85,7 @@ def assert_in_order(path) -> None:
 
 
 def notes_of(path, system: mph.PinholeSystem) -> dict[int, object]:
-    """The note in each module's row."""
+    """Return the note in each module's row."""
     values = values_of(path)
     row_of = {value: cell for (_, cell), value in values.items() if str(value).startswith("note of")}
     notes = {"".join(filter(str.isdigit, cell)): note for note, cell in row_of.items()}

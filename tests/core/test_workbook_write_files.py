@@ -64,7 +64,7 @@ def moved(system: mph.PinholeSystem) -> mph.PinholeSystem:
 
 @pytest.fixture
 def rich(tmp_path) -> Path:
-    """A workbook with all that openpyxl loses or rewrites, and macros."""
+    """Return a workbook with all that openpyxl loses or rewrites, and macros."""
     book = template_workbook(TemplateLayout(seed=5))
     table = book["Coordinates"]
     chart = LineChart()
@@ -191,7 +191,7 @@ UNREADABLE = {
 
 
 def _edit(system: mph.PinholeSystem) -> mph.PinholeSystem:
-    """Moved, one removed, one added."""
+    """Return the system with one module moved, one removed, one added."""
     part = moved(system)[[0, 1, 3]]
     arrays = {name: np.append(getattr(part, name), getattr(part, name)[0]) for name in SIZES}
     centers = np.concatenate([part.centers, [[7.0, 210.0, 33.125]]])
@@ -200,7 +200,7 @@ def _edit(system: mph.PinholeSystem) -> mph.PinholeSystem:
 
 @pytest.fixture(scope="module")
 def plain_written(tmp_path_factory):
-    """A system, and the result of writing it into a workbook with usual XML."""
+    """Return a system, and the result of writing it into a workbook with usual XML."""
     folder = tmp_path_factory.mktemp("plain")
     plain = folder / "plain.xlsx"
     plain.write_bytes(template_content(seed=11))

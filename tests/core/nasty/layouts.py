@@ -299,7 +299,7 @@ def _is_plain(layout: Layout, kinds: Sequence[str]) -> bool:
     """Return whether a layout must be understood."""
     usual = layout.style in ("symbols", "descriptions", "both") and layout.second in ("", "sheet") and layout.top < 10
     rows = not layout.once or (layout.once == "row" and "" in layout.labels and layout.second == "sheet")
-    labels = len(set(kinds)) == 1 and kinds[0] in ("numbers", "formulas", "unstored", "")
+    labels = set(kinds) <= set(NUMBERS) or set(kinds) == {""}
     labels = labels and layout.number in ("No.", "Definitions", "Module", "Nr.")
     return bool(
         usual

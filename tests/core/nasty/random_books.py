@@ -65,6 +65,11 @@ class Recipe:
         return ", ".join(words or fields)[:90] or "usual"
 
     @property
+    def group(self) -> str:
+        """The kind of its first decoration."""
+        return self.elements[0].decorate.__name__ if self.elements else "layouts"
+
+    @property
     def fitting(self) -> Layout:
         """The layout as the decorations need it."""
         fields = {field.name for field in dataclasses.fields(Layout)}
@@ -152,5 +157,5 @@ def every_recipe() -> Iterator[Recipe]:
     """Yield recipes in which every choice of a layout, every program and every decoration occurs alone."""
     for layout, program in zip(dict.fromkeys(VARIED), cycle(PROGRAMS), strict=False):
         yield Recipe(layout, (), program)
-    for element, layout in zip(ELEMENTS, cycle(BASES), strict=False):
-        yield Recipe(layout, (element,))
+    recipes = [Recipe(layout, (element,)) for element, layout in zip(ELEMENTS, cycle(BASES), strict=False)]
+    yield from sorted(recipes, key=lambda recipe: recipe.group)

@@ -164,15 +164,17 @@ class Projector(LinearOperator):
             return self._apply(x, progress, mu)
         from ..rays import autograd
 
-        def run(needs: Any) -> Any:
-            def gradients(images: ArrayOrTensor, needs: Any) -> Any:
+        def images_and_gradient(_needs: Any) -> Any:
+            """Return the images, and the function that turns their gradient into those of `x` and `mu`."""
+
+            def input_gradients(d_images: ArrayOrTensor, needs: Any) -> Any:
                 needs_x, needs_mu = needs
-                d_x = self.T._run(images, mu=mu) if needs_x else None
-                return d_x, self._mu_gradient(images, x, mu) if needs_mu else None
+                d_x = self.T._run(d_images, mu=mu) if needs_x else None
+                return d_x, self._mu_gradient(d_images, x, mu) if needs_mu else None
 
-            return self._run(x.detach(), progress, mu.detach()), gradients
+            return self._run(x.detach(), progress, mu.detach()), input_gradients
 
-        return autograd.step(run, x, mu)
+        return autograd.step(images_and_gradient, x, mu)
 
     @property
     def backend(self) -> str:

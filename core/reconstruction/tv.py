@@ -72,6 +72,7 @@ def tv(
     radius = np.float32(weight / scale)
 
     def step(number: int, x: Array, progress: Progress | None) -> tuple[Array, float]:
+        """Return the next volume after `x`, and its objective, in iteration `number`."""
         # The state's keys are those of resumable files: images A x ("seen"), extrapolated images and volume ("ahead",
         # "beyond"), and the dual variables of images and of the volume's gradient ("misfit", "slopes").
         keys = ("seen", "ahead", "beyond", "misfit", "slopes")

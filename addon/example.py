@@ -54,12 +54,14 @@ def example_job(context: bpy.types.Context, of_xrays: bool = False, replace: boo
     display = Display("grey", "log") if of_xrays else scene.mphdrr_display.display()
 
     def work(progress: Progress) -> Any:
+        """Voxelize the phantom and project it; return the stored volumes, the run and its pictures."""
         stages = stages_of(progress)
         stored_volumes = adding.work(progress)
         (run,) = run_recipe(recipe, system, stored_volumes[-1].volume, stages=stages)
         return stored_volumes, run, rendering.write_and_draw(run, path, display, stages)
 
     def finish(result: Any) -> jobs.Finishing:
+        """Put scanner, phantom and run into the scene, and return the line to report."""
         stored_volumes, run, pictures = result
         scene = jobs.require_scene(scene_uid, "the projections are")
         if of_xrays:

@@ -44,15 +44,15 @@ _RENDER = Step("mphdrr.render_projections", "Render Projections", "RENDER_STILL"
 
 
 def work_stages(context: bpy.types.Context) -> list[WorkStage]:
-    """Return the stages of the work in their order."""
-    scene = context.scene
-    collection, run, items = scanner.active_scanner(scene), _shown_run(scene), _projectable_volumes(scene)
+    """Return the stages of the work from scanner to event set, in their order."""
+    scene, run = context.scene, _shown_run(context.scene)
+    collection, names = scanner.active_scanner(scene), [item.name for item in _projectable_volumes(scene)]
     changes, reconstruction = (_scene_changes(scene), spect_ct.reconstruction_details(scene)) if run else ([], {})
     scores = reconstruction.get("scores", ())
     note = event_notes.set_note(scene.mphdrr_events.folder)
     return [
         WorkStage("Scanner", collection.name if collection else ""),
-        WorkStage("Phantom", items[0].name if len(items) == 1 else f"{len(items)} volumes" if items else ""),
+        WorkStage("Phantom", names[0] if len(names) == 1 else f"{len(names)} volumes" if names else ""),
         WorkStage("Run", changes[0] if changes else run.summary.partition(",")[0] if run else "", bool(changes)),
         WorkStage("Reconstruction", ": ".join(scores[0]) if scores else "not scored" if reconstruction else ""),
         WorkStage("Event Set", note.text.partition(",")[0] if note else ""),
@@ -60,7 +60,7 @@ def work_stages(context: bpy.types.Context) -> list[WorkStage]:
 
 
 def next_step(context: bpy.types.Context) -> Step:
-    """Return the step that comes next."""
+    """Return the step that comes next: the first stage of the work that the scene has not done, or has to do again."""
     scene, run = context.scene, _shown_run(context.scene)
     if run is None and scanner.active_scanner(scene) is None:
         return Step("mphdrr.load_example", "Load Example", "PLAY")
@@ -73,9 +73,9 @@ def next_step(context: bpy.types.Context) -> Step:
     if spect_ct.spect_inputs(scene):
         return Step("mphdrr.use_ct", "Use CT for SPECT", "MOD_FLUIDSIM")
     if _is_without_dose(scene):
-        isotope = {"isotope": runs.run_settings(scene)["model.isotope"]}
-        item = scene.mphdrr_reconstruction.volume
-        return Step("mphdrr.add_dose_map", "Dose Map", "OUTLINER_DATA_VOLUME", isotope, item)
+        settings = {"isotope": runs.run_settings(scene)["model.isotope"]}
+        reconstruction = scene.mphdrr_reconstruction.volume
+        return Step("mphdrr.add_dose_map", "Dose Map", "OUTLINER_DATA_VOLUME", settings, reconstruction)
     if scene.mphdrr_events.recipe:
         return Step("mphdrr.make_event_set", "Make Event Set", "FILE_CACHE")
     return Step("mphdrr.export_dataset", "Export Dataset", "EXPORT")
@@ -92,8 +92,8 @@ def tutorial() -> str:
 
 def _projectable_volumes(scene: bpy.types.Scene) -> list[bpy.types.Object]:
     """Return the volumes of the scene that may be projected: all but the reconstruction and the scanner's maps (`MAPS`)."""
-    result = scene.mphdrr_reconstruction.volume
-    return [item for item in volumes.volume_objects(scene) if item != result and volumes.quantity_of(item) not in MAPS]
+    excluded, objects = scene.mphdrr_reconstruction.volume, volumes.volume_objects(scene)
+    return [item for item in objects if item != excluded and volumes.quantity_of(item) not in MAPS]
 
 
 def _shown_run(scene: bpy.types.Scene) -> bpy.types.PropertyGroup | None:

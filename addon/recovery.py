@@ -40,9 +40,11 @@ def remake_job(scene: bpy.types.Scene) -> jobs.Job:
         raise InputError("no phantom or map misses its files, or none can be made again")
 
     def work(progress: Progress) -> list[Any]:
+        """Do the work of each job, and return the results in order."""
         return [job.work(part_of(progress, k, len(named_jobs)) or progress) for k, (_, job) in enumerate(named_jobs)]
 
     def finish(results: list[Any]) -> Generator[None, None, str]:
+        """Put the results of the jobs into the scene one by one, and return the line to report."""
         for (_, job), result in zip(named_jobs, results, strict=True):
             job.finish(result)
             yield

@@ -41,6 +41,7 @@ def use_ct_job(context: bpy.types.Context) -> jobs.Job:
     add = job.finish
 
     def finish(result: Any) -> str:
+        """Add the CT, make it the attenuation of the SPECT that comes next, and return the line to report."""
         scene = jobs.require_scene(uid, "the CT is")
         inputs, body = spect_inputs(scene), runs.projected_volume(scene)
         text = str(add(result))

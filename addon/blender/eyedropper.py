@@ -54,6 +54,7 @@ class Eyedropper:
         self._end(context, "CANCELLED")
 
     def _end(self, context: bpy.types.Context, result: str) -> set[str]:
+        """End the picking: restore the cursor and the status bar, and return `result` for Blender."""
         context.window.cursor_modal_restore()
         context.workspace.status_text_set(None)
         return {result}

@@ -158,6 +158,7 @@ class Worker(threading.Thread):
         """Begin a stage and return its progress function, which raises `Cancelled` once the job is cancelled."""
 
         def progress(done: int, total: int) -> None:
+            """Show the progress of the stage, and stop the job where it was cancelled."""
             self.show(stage, done, total)
             if self.cancel.is_set():
                 raise Cancelled

@@ -107,10 +107,12 @@ def check_mark(name: str, word: str, text: str, first_value: Any) -> Any:
     zero = (0.0,) * len(first_value) if isinstance(first_value, tuple) else type(first_value)(0)
 
     def is_unset(owner: Any) -> bool:
+        """Return whether the number is left out."""
         value = getattr(owner, name)
         return not (any(value) if isinstance(first_value, tuple) else value)
 
     def set_unset(owner: Any, unset: bool) -> None:
+        """Leave the number out, or give it a value."""
         if unset != is_unset(owner):
             setattr(owner, name, zero if unset else first_value)
 

@@ -302,6 +302,7 @@ def before_save(filepath: str, _: Any = None) -> None:
     is_new = filepath != bpy.data.filepath
 
     def is_wanted(name: str, path: Path) -> bool:
+        """Return whether a file is to be copied beside the saved .blend."""
         return _is_temporary(path) or (is_new and copies and path.parent.name.endswith(_FOLDER))
 
     gathered = _gather_files(_folder_of(filepath), is_wanted)

@@ -16,6 +16,7 @@ def on_edit(name: str, *arguments: Any) -> Callable[[bpy.types.PropertyGroup, bp
     """Return a property's ``update=`` function, which calls ``FUNCTIONS[name](group.id_data, *arguments)``."""
 
     def update(group: bpy.types.PropertyGroup, context: bpy.types.Context) -> None:
+        """Call the registered function for an edited property."""
         FUNCTIONS[name](group.id_data, *arguments)
 
     return update

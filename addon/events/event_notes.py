@@ -64,15 +64,16 @@ def stop() -> None:
 def _read_recipe(path: Path) -> Note:
     """Return a note on phantoms, models and voxels; raise `InputError` also where a file named in the recipe is missing."""
     recipe = events.read_recipe(path)
-    for name in recipe.files:
-        recipe.input(name)
-    names = [", ".join(entry.name for entry in recipe.phantoms), *([", ".join(recipe.models)] if recipe.models else [])]
-    if recipe.radon is not None:
-        names.append("Radon " + ", ".join(map(str, recipe.radon.counts)))
+    for file_name in recipe.files:
+        recipe.input(file_name)
+    phantoms, image_models = ", ".join(phantom.name for phantom in recipe.phantoms), ", ".join(recipe.models)
+    radon = "" if recipe.radon is None else "Radon " + ", ".join(map(str, recipe.radon.counts))
     shape, spacing = recipe.grid.shape, recipe.grid.spacing
-    voxels = f"{shape[0]}³" if len(set(shape)) == 1 else " × ".join(map(str, shape))
-    sides = f"{spacing[0]:.3g}" if np.allclose(spacing, spacing[0]) else " × ".join(f"{side:.3g}" for side in spacing)
-    return Note(f"{'; '.join(names)}; {voxels} voxels of {sides} mm")
+    shape_text = f"{shape[0]}³" if len(set(shape)) == 1 else " × ".join(map(str, shape))
+    edges = spacing[:1] if np.allclose(spacing, spacing[0]) else spacing  # of a voxel, mm
+    spacing_text = " × ".join(f"{edge:.3g}" for edge in edges)
+    names = [phantoms, *filter(None, (image_models, radon))]
+    return Note(f"{'; '.join(names)}; {shape_text} voxels of {spacing_text} mm")
 
 
 def _read_set(path: Path) -> Note:
@@ -118,10 +119,10 @@ def _stamp(path: Path) -> _Stamp:
 def _cached_stamp(path: Path, interval: float) -> _Stamp:
     """Return a stamp; `interval`, the number of the present two seconds, lets the cache forget older stamps."""
     stamp = []
-    for item in (path, path / RECIPE, path / INDEX, path / EVENTS, path / SHARDS):
+    for member_path in (path, path / RECIPE, path / INDEX, path / EVENTS, path / SHARDS):
         with contextlib.suppress(OSError):
-            state = item.stat()
-            stamp.append((state.st_mtime_ns, state.st_size))
+            status = member_path.stat()
+            stamp.append((status.st_mtime_ns, status.st_size))
     return tuple(stamp)
 
 

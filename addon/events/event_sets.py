@@ -73,10 +73,12 @@ def try_event_job(context: bpy.types.Context, filepath: str, number: int, folder
     target, uid = _make_target(_phantom_to_try(context)), scene.session_uid
 
     def work(progress: Progress) -> tuple[_Phantom, str]:
+        """Store the voxels of the event's phantom; return it with a description of the event."""
         planned = events.plan(read(), number)
         return _store_phantom(planned, target, files, progress), _describe(planned)
 
     def finish(result: tuple[_Phantom, str]) -> str:
+        """Put the phantom into the scene, and return the line to report."""
         phantom, text = result
         scene = jobs.require_scene(uid, "the event is")
         settings = scene.mphdrr_events
@@ -99,6 +101,7 @@ def make_set_job(filepath: str, folder: str, count: int) -> jobs.Job:
     new_events: list[events.Made] = []
 
     def work(progress: Progress) -> float:
+        """Make the missing events, and return the seconds that it took."""
         start = time.perf_counter()
         report = stages_of(progress)("making events") or progress
 
@@ -112,6 +115,7 @@ def make_set_job(filepath: str, folder: str, count: int) -> jobs.Job:
         return time.perf_counter() - start
 
     def finish(seconds: float) -> str:
+        """Return the line to report: the number, size and folder of the events that were made."""
         n_events = len(SetFolder(path).store.locations())
         if not new_events:
             return f"All events asked for are there already: {n_events} in {path}"
@@ -119,6 +123,7 @@ def make_set_job(filepath: str, folder: str, count: int) -> jobs.Job:
         return f"Made {_events_text(len(new_events))}, {size} in {seconds:.1f} s: {n_events} in {path}"
 
     def leftovers() -> str:
+        """Return the line for a cancelled job: the number of events that were made and stay."""
         return f"{_events_text(len(new_events))} made now and kept; Make Event Set goes on from there"
 
     return jobs.Job("Making an event set", work, finish, leftovers=leftovers)
@@ -149,6 +154,7 @@ def open_event_job(context: bpy.types.Context, folder: str, number: int, model: 
     run_file, display, uid = rendering.new_run_path(scene), scene.mphdrr_display.display(), scene.session_uid
 
     def work(progress: Progress) -> _StoredEvent:
+        """Read the event, and store its voxels, its run and the run's pictures."""
         stages = stages_of(progress)
         stages("reading the event")
         event = _read_event(path, number)
@@ -165,6 +171,7 @@ def open_event_job(context: bpy.types.Context, folder: str, number: int, model: 
         return _StoredEvent(name, _describe(planned), truth, phantom, run, pictures)
 
     def finish(stored_event: _StoredEvent) -> jobs.Finishing:
+        """Put the truth, the phantom and the run of the event into the scene, and return the line to report."""
         run, mosaic = stored_event.run, None
         if run is not None and stored_event.pictures is not None:
             mosaic = yield from images.store_images(run, stored_event.pictures)

@@ -68,6 +68,7 @@ class _Ramp(Display):
     ramp: volume_materials.Ramp = ()
 
     def colored(self, values: ArrayLike, window: tuple[float, float] | None = None) -> NDArray[np.uint8]:
+        """Return the colours (..., 3) of `values`, uint8, from the ramp's first to last number in `window`."""
         table = np.rint(255 * slices.color_table("", self.ramp)[:, :3]).astype(np.uint8)
         return table[np.rint(255 * self.shares(values, window or self.window(values))).astype(int)]
 
@@ -120,6 +121,7 @@ def figure_job(
     require(kind.needs, {*subject_values, *readers}, kind.name, _MISSING)
 
     def work(progress: Progress) -> FigureSubject:
+        """Read what the figure needs from files, and return its subject."""
         progress(0, 1)
         read_values = {key: read() for key, read in readers.items()}
         if "run" in read_values:
@@ -129,12 +131,14 @@ def figure_job(
     reel = Reel()
 
     def finish(subject: FigureSubject) -> Generator[Step, None, str]:
+        """Draw the figure step by step, write and show it, and return the line to report."""
         yield from draw_figure(page, subject, kind, item, paths, options, reel)
         if windows.has_window() and paths[0].suffix == ".png":
             images.show_file(paths[0], bpy.context)
         return f"Wrote {', '.join(map(str, paths))}"
 
     def leftovers() -> str:
+        """Return the line for a cancelled job: the folder of the pictures that were drawn."""
         pictures = reel.pictures
         return f"{len(pictures)} pictures are in {pictures[0].parent}" if pictures else "nothing was changed"
 

@@ -66,7 +66,7 @@ class FigureScene:
         self.scene = scene = bpy.data.scenes.new(ids.STUDIO)
         self.radius = self.full_system.region_radius()
         self.volume_objects: list[bpy.types.Object] = []
-        self._modules = list[tuple[bpy.types.Mesh, NDArray[np.intp]]]()
+        self._meshes = list[tuple[bpy.types.Mesh, NDArray[np.intp]]]()  # each with the index of every face's module
         try:
             studio.furnish(scene)
             scene.frame_set(bpy.context.scene.frame_current)
@@ -102,30 +102,28 @@ class FigureScene:
         if not self.studio.near:
             points = np.concatenate([points, *(part.vertices for part in self.full_system.parts())])
         aim_camera(self.camera, direction, self.page, points, self.top)
-        # The scale at the isocentre.
-        longer_side, distance = (
-            max(self.page.width, self.page.height),
-            float(np.array(self.camera.location) @ direction),
-        )
-        self.pixels_per_mm = longer_side * self.studio.lens / _SENSOR_WIDTH / distance
+        longer_side = max(self.page.width, self.page.height)
+        distance = float(np.array(self.camera.location) @ direction)
+        self.pixels_per_mm = longer_side * self.studio.lens / _SENSOR_WIDTH / distance  # at the isocentre
         numbers, self.ray_numbers = self.system.numbers, rays
         facing = -self.system.frames()[:, 2] @ direction
-        opacity = np.clip((_GONE - facing) / (_GONE - _SOLID), 0.0, 1.0) if self.studio.cut else np.ones(len(numbers))
-        opacity = np.maximum(opacity, _MIN_OPACITY * np.isin(numbers, rays) * (len(rays) == 1))
-        values = {"lit": _TINT * np.isin(numbers, lit) * self.studio.lit, "there": opacity}
-        for mesh, module in self._modules:
-            for name, value in values.items():
-                mesh.attributes[name].data.foreach_set("value", value[module].astype(np.float32))
+        fades = np.clip((_GONE - facing) / (_GONE - _SOLID), 0.0, 1.0)
+        opacities = fades if self.studio.cut else np.ones(len(numbers))
+        opacities = np.maximum(opacities, _MIN_OPACITY * np.isin(numbers, rays) * (len(rays) == 1))
+        attribute_values = {"lit": _TINT * np.isin(numbers, lit) * self.studio.lit, "opacity": opacities}
+        for mesh, face_modules in self._meshes:
+            for name, module_values in attribute_values.items():
+                mesh.attributes[name].data.foreach_set("value", module_values[face_modules].astype(np.float32))
             mesh.update()
-        for number, share in zip(numbers.tolist(), opacity, strict=True):
+        for number, opacity in zip(numbers.tolist(), opacities, strict=True):
             if number in self.rays:
-                self.rays[number].hide_render = number not in rays or not share
+                self.rays[number].hide_render = number not in rays or not opacity
 
-    def moment(self, share: float) -> Moment:
-        """Return camera angle, lit modules and modules with rays at fraction `share` of the animation."""
+    def moment(self, fraction: float) -> Moment:
+        """Return camera angle, lit modules and modules with rays after a fraction, 0 to 1, of the animation's time."""
         if self._motion == "turn":
-            return 2 * np.pi * share, self.numbers, self.numbers
-        index = int(share * len(self.numbers))
+            return 2 * np.pi * fraction, self.numbers, self.numbers
+        index = int(fraction * len(self.numbers))
         return 0.0, self.numbers[: index + 1], [self.numbers[index]]
 
     def draw_surface(self, mesh: Mesh, colors: volume_materials.Ramp) -> None:
@@ -148,20 +146,20 @@ class FigureScene:
 
     def _add_modules(self) -> None:
         """Add all collimators as one object, and all crystals as another."""
-        numbered = dict(zip(self.system.numbers.tolist(), range(len(self.system)), strict=True))
+        module_index = dict(zip(self.system.numbers.tolist(), range(len(self.system)), strict=True))
         parts = self.system.parts(self.subject.construction)
         for kind in dict.fromkeys(part.kind for part in parts):
             kind_parts = [part for part in parts if part.kind == kind]
-            firsts = np.cumsum([0, *(len(part.vertices) for part in kind_parts)])
-            faces = [part.solid[1] + first for part, first in zip(kind_parts, firsts[:-1], strict=True)]
+            first_vertices = np.cumsum([0, *(len(part.vertices) for part in kind_parts)])
+            faces = [part.solid[1] + first for part, first in zip(kind_parts, first_vertices[:-1], strict=True)]
             mesh = bpy.data.meshes.new(ids.STUDIO)
             vertices = np.concatenate([part.vertices for part in kind_parts])
             collimators.reshape_mesh(mesh, (vertices, np.concatenate(faces)))
             mesh.materials.append(_figure_material(kind.upper()))
-            for name in ("lit", "there"):
+            for name in ("lit", "opacity"):
                 mesh.attributes.new(name, "FLOAT", "FACE")
-            module = np.repeat([numbered[part.number] for part in kind_parts], [len(f) for f in faces])
-            self._modules.append((mesh, module))
+            face_modules = np.repeat([module_index[part.number] for part in kind_parts], [len(f) for f in faces])
+            self._meshes.append((mesh, face_modules))
             self.add_object(mesh)
 
     def _add_volume(self, item: bpy.types.Object) -> None:
@@ -236,7 +234,7 @@ def _set_backdrop(world: bpy.types.World, paper: str) -> None:
 def _figure_material(part: str) -> bpy.types.Material:
     """Return a copy of a part's material that follows two attributes of faces.
 
-    Attribute "lit" mixes in the accent's colour; attribute "there" is the opacity.
+    Attribute "lit" mixes in the accent's colour; attribute "opacity" is the opacity, 0 to 1.
     """
     material = collimators.part_material(part).copy()
     material.name, tree = ids.STUDIO, material.node_tree
@@ -246,7 +244,7 @@ def _figure_material(part: str) -> bpy.types.Material:
     add_node, surface = partial(compat.add_node, tree), output.inputs["Surface"]
     lit, opacity = (
         add_node("ShaderNodeAttribute", (600, y), attribute_name=name).outputs["Fac"]
-        for name, y in (("lit", 300), ("there", 500))
+        for name, y in (("lit", 300), ("opacity", 500))
     )
     lit_inputs = {"Base Color": _ACCENT, "Roughness": 0.5, "Emission Color": _ACCENT, "Emission Strength": _GLOW}
     accent = add_node("ShaderNodeBsdfPrincipled", (600, -200), lit_inputs).outputs[0]

@@ -65,6 +65,7 @@ def frustum_job(context: bpy.types.Context, planes: int, uniform: str) -> jobs.J
     memory.require(_BYTES_PER_PIXEL * planes * rows * columns, f"{planes} pictures of {columns} x {rows} pixels")
 
     def work(progress: Progress) -> tuple[PerspectiveGrid, list[bytes]]:
+        """Resample the volume to the frustum; return its grid and a PNG file of each plane."""
         stages = stages_of(progress)
         _, g, array = _resample_to_frustum(request, planes, uniform, stages)
         packing, files = stages("packing"), list[bytes]()
@@ -74,6 +75,7 @@ def frustum_job(context: bpy.types.Context, planes: int, uniform: str) -> jobs.J
         return g, files
 
     def finish(result: tuple[PerspectiveGrid, list[bytes]]) -> str:
+        """Add the frustum to the scene in place of the camera's earlier one, and return the line to report."""
         scene, camera = jobs.find_by_uid(bpy.data.scenes, scene_uid), jobs.find_by_uid(bpy.data.objects, request.camera)
         if scene is None or camera is None:
             raise InputError(f"{request.module} is gone")
@@ -100,11 +102,13 @@ def resample_job(context: bpy.types.Context, cells: int, uniform: str) -> jobs.J
     provenance = {"volume": request.name, "through": request.module, "cells": shape, "evenly_in": uniform}
 
     def make(progress: Progress) -> Volume:
+        """Return the volume resampled to the frustum's cells and back to its own voxels."""
         stages = stages_of(progress)
         volume, g, array = _resample_to_frustum(request, cells, uniform, stages)
         return to_voxels(array, g, volume, stages("back on voxels"))
 
     def finish(item: bpy.types.Object, stored: stored_volumes.StoredVolume) -> str:
+        """Give the new volume the display range of the old one, and return the line to report."""
         item.mphdrr_volume.display_low, item.mphdrr_volume.display_high = display_range
         return f"Added {item.name!r}: {volumes.values_text(stored)}"
 

@@ -119,9 +119,11 @@ def add_phantom_job(
     poses = [np.eye(4) if pose is None else pose] * len(quantities)
 
     def work(progress: Progress) -> list[StoredVolume]:
+        """Voxelize the phantom for each quantity, and store the volumes."""
         return phantom_job.voxelize(quantities, poses, folder, progress)
 
     def finish(stored: list[StoredVolume]) -> str:
+        """Add the phantom's objects to the scene, and return the line to report."""
         if kind == FILE and "text" not in values:
             values["text"] = bpy.data.texts.new(phantom_job.settings["file"])
             values["text"].from_string(phantom_job.settings["text"])
@@ -161,6 +163,7 @@ def update_phantom_job(item: bpy.types.Object, bake: bool = False) -> jobs.Job:
     work, name, old_settings = make_voxelizer(item, bake), item.name, settings_of(item).values()
 
     def finish(stored: list[StoredVolume]) -> str:
+        """Replace the phantom's voxels in the scene, and return the line to report."""
         item = bpy.data.objects.get(name)
         settings = settings_of(item)
         if item is None or settings is None:

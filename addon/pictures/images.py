@@ -90,38 +90,38 @@ def store_images(run: ProjectionRun, files: Pictures) -> Generator[tuple[str, in
     return mosaic
 
 
-def recolor_images(display: Display, arrays: dict[int, NDArray[np.float32]]) -> Generator[bool, None, None]:
+def recolor_images(display: Display, cached_projections: dict[int, NDArray[np.float32]]) -> Generator[bool, None, None]:
     """Yield while making the pictures of the shown run again from its exact images, as `display` says.
 
-    Each yielded value says whether the mosaic, which is the first picture, is made. `arrays` keeps the projections that
+    Each yielded value says whether the mosaic, which is the first picture, is made. `cached_projections` keeps those that
     were read, by the mosaic's `session_uid`, for the next call.
     """
     mosaic = bpy.data.images.get(ids.MOSAIC)
     mosaic_tiles = tiles(mosaic)
     if mosaic is None or mosaic_tiles is None:
         return
-    numbers, rings, unit = (mosaic_tiles[name] for name in ("numbers", "rings", "unit"))
-    texts = str(mosaic[_LABELS]).split("\n") if _LABELS in mosaic else list(map(str, numbers))
-    names, uid = [projection_name(number, numbers) for number in numbers], mosaic.session_uid
-    if uid not in arrays:
+    numbers, rings, unit = (mosaic_tiles[key] for key in ("numbers", "rings", "unit"))
+    labels = str(mosaic[_LABELS]).split("\n") if _LABELS in mosaic else list(map(str, numbers))
+    image_names, mosaic_uid = [projection_name(number, numbers) for number in numbers], mosaic.session_uid
+    if mosaic_uid not in cached_projections:
         exact_arrays = []
-        for name in names:
-            if (exact := bpy.data.images.get(name)) is None:
+        for image_name in image_names:
+            if (exact_image := bpy.data.images.get(image_name)) is None:
                 return
-            exact_arrays.append(projection_array(exact))
+            exact_arrays.append(projection_array(exact_image))
             yield False
-        arrays.clear()
-        arrays[uid] = np.stack(exact_arrays)
+        cached_projections.clear()
+        cached_projections[mosaic_uid] = np.stack(exact_arrays)
         del exact_arrays
-    projections = arrays[uid]
-    file, layout = yield from _run_in_worker(lambda _: _draw_mosaic(projections, texts, rings, unit, display), False)
-    mosaic = fill(bpy.data.images[ids.MOSAIC], file)
+    projections = cached_projections[mosaic_uid]
+    png, layout = yield from _run_in_worker(lambda _: _draw_mosaic(projections, labels, rings, unit, display), False)
+    mosaic = fill(bpy.data.images[ids.MOSAIC], png)
     _store_tiles(_load_pixels(mosaic), layout, numbers, rings, unit, None)
-    files = yield from _run_in_worker(lambda progress: _color(projections, display, progress), True)
-    for name, file in zip(names, files, strict=True):
-        picture = bpy.data.images.get(ids.picture_name(name))
+    pngs = yield from _run_in_worker(lambda progress: _color(projections, display, progress), True)
+    for image_name, png in zip(image_names, pngs, strict=True):
+        picture = bpy.data.images.get(ids.picture_name(image_name))
         if picture is not None:
-            _load_pixels(fill(picture, file))
+            _load_pixels(fill(picture, png))
             yield True
     _store_tiles(bpy.data.images[ids.MOSAIC], layout, numbers, rings, unit, display)
 

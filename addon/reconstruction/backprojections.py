@@ -24,6 +24,7 @@ def backproject_job(context: bpy.types.Context, recipe: Recipe, how: str) -> job
     label, start = HOW_LABELS[how], time.perf_counter()
 
     def work(progress: Progress) -> stored_volumes.StoredVolume:
+        """Back-project the run, and store the volume."""
         stages = stages_of(progress)
         stages("reading the run")
         run = read_run(path)
@@ -34,6 +35,7 @@ def backproject_job(context: bpy.types.Context, recipe: Recipe, how: str) -> job
         return stored_volumes.store_volume(volume, folder, None, provenance)
 
     def finish(stored: stored_volumes.StoredVolume) -> str:
+        """Add the back-projection to the scene, and return the line to report."""
         scene = jobs.require_scene(uid, "the back-projection is")
         item = volumes.add_stored(stored, f"{name} {label}", scene.collection)
         volumes.make_active(bpy.context, item)

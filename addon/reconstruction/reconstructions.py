@@ -114,6 +114,7 @@ def _make_job(
     live = _LiveResult(context, f"{name} {method.label}", previous)
 
     def work(progress: Progress) -> tuple[_ShownState, Reconstruction]:
+        """Reconstruct the run; return the last state to show and the reconstruction."""
         stages = stages_of(progress)
         stages("reading the run")
         run = read_run(path)
@@ -123,6 +124,7 @@ def _make_job(
         def make_state(
             values: NDArray[Any], objective: Sequence[float], scores: Mapping[str, Any] = {}, flatters: Any = ()
         ) -> _ShownState:
+            """Store a volume with its picture and record, to be shown in the scene."""
             volume = Volume(values, grid, "activity" if run.volume is None else run.volume.quantity)
             record = {
                 "title": ", ".join(filter(None, (method.label, iterations_text(len(objective))))),
@@ -135,6 +137,7 @@ def _make_job(
             return _ShownState(stored, picture, record)
 
         def watch(iteration: int, values: NDArray[Any], objective: Sequence[float]) -> bool:
+            """Make the volume of an iteration ready to be shown, at most every few seconds; return whether to stop."""
             nonlocal last_shown
             if time.monotonic() - last_shown > _MIN_INTERVAL and has_window:
                 live.unshown = make_state(np.array(values), objective)
@@ -152,6 +155,7 @@ def _make_job(
         return state, result
 
     def finish(result: tuple[_ShownState, Reconstruction]) -> str:
+        """Show the final volume and its scores, and return the line to report."""
         jobs.require_scene(uid, "the reconstruction is")
         state, reconstruction = result
         item = live.show(state)

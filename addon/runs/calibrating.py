@@ -30,10 +30,12 @@ def calibrate_job(context: bpy.types.Context, path: Path, apply: bool = True, ex
     uid = collection.session_uid
 
     def work(progress: Progress) -> tuple[Calibration, bytes]:
+        """Calibrate the scanner; return the calibration and a picture of its residuals as a PNG file."""
         calibration = run_calibration(path, progress)
         return calibration, png_bytes(calibration.residual_sheet().picture)
 
     def finish(result: tuple[Calibration, bytes]) -> str:
+        """Show the shifts, move the modules if `apply` is set, and return the line to report."""
         calibration, picture = result
         collection = jobs.find_by_uid(bpy.data.collections, uid)
         if collection is None:

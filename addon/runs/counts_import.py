@@ -46,11 +46,13 @@ def import_counts_job(context: bpy.types.Context, paths: list[Path], entries: Ma
     scene_uid, scanner_uid = scene.session_uid, collection.session_uid
 
     def work(progress: Progress) -> tuple[ProjectionRun, images.Pictures]:
+        """Read the counts as a run, write its file, and return it with its pictures."""
         stages = stages_of(progress)
         run = recipe_counts(recipe, system, stages)
         return run, rendering.write_and_draw(run, path, display, stages)
 
     def finish(result: tuple[ProjectionRun, images.Pictures]) -> jobs.Finishing:
+        """Show the run at the scanner's modules, and return the line to report."""
         run, pictures = result
         scene = jobs.require_scene(scene_uid, "the projections are")
         owner = jobs.find_by_uid(bpy.data.collections, scanner_uid)

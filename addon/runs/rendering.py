@@ -57,6 +57,7 @@ def render_job(context: bpy.types.Context, recipe: Recipe, volume: str = "", mu:
     scene_uid, scanner_uid, start = scene.session_uid, collection.session_uid, time.perf_counter()
 
     def work(progress: Progress) -> list[tuple[ProjectionRun, images.Pictures]]:
+        """Project the volume; write the run of each frame, and return the runs with their pictures."""
         stages = stages_of(progress)
         warn_of_energy(model, energy, repr(recipe["attenuation.object"]))
         stages("reading")
@@ -64,6 +65,7 @@ def render_job(context: bpy.types.Context, recipe: Recipe, volume: str = "", mu:
         return [(run, write_and_draw(run, path, display, stages)) for run, path in zip(frames, paths, strict=True)]
 
     def finish(result: list[tuple[ProjectionRun, images.Pictures]]) -> jobs.Finishing:
+        """Put the runs into the scene's list, show the last, and return the line to report."""
         scene = jobs.require_scene(scene_uid, "the projections are")
         owner = jobs.find_by_uid(bpy.data.collections, scanner_uid)  # may no longer be the panel's
         for number, (path, (run, pictures)) in enumerate(zip(paths, result, strict=True)):
@@ -75,6 +77,7 @@ def render_job(context: bpy.types.Context, recipe: Recipe, volume: str = "", mu:
         return f"Projected {recipe['volume.object']!r} into {len(run.views)} modules in {seconds:.1f} s: {location}"
 
     def undo() -> None:
+        """Remove the run files of a cancelled job."""
         for path in paths:
             path.unlink(missing_ok=True)
 
@@ -160,6 +163,7 @@ def export_job(scene: bpy.types.Scene, path: Path) -> jobs.Job:
         warn(f"the run is not of the scene as it is now ({'; '.join(changes)}): {path.name} holds what was rendered")
 
     def work(progress: Progress) -> None:
+        """Write the shown run to the chosen file."""
         stages_of(progress)("reading the run file")
         run = read_run(source)
         stages_of(progress)("writing the file")
@@ -248,10 +252,12 @@ def show_run_job(scene: bpy.types.Scene, index: int) -> jobs.Job:
     display = scene.mphdrr_display.display()
 
     def work(progress: Progress) -> tuple[ProjectionRun, images.Pictures]:
+        """Read the run, and return it with its pictures."""
         run = read_run(path)
         return run, images.make_pictures(run, display, stages_of(progress)("packing"))
 
     def finish(result: tuple[ProjectionRun, images.Pictures]) -> jobs.Finishing:
+        """Show the run's pictures at the scanner's modules, and return the line to report."""
         run, pictures = result
         scene = jobs.require_scene(uid, "the projections are")
         files = [item.file for item in scene.mphdrr_projections.runs]

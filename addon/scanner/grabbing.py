@@ -29,8 +29,8 @@ def set_home(item: bpy.types.Object, matrix: Matrix) -> None:
     item[_HOME] = [x for row in matrix for x in row]
 
 
-def is_part(item: bpy.types.Object) -> bool:
-    """Return whether moving an object moves a module."""
+def is_module_part(item: bpy.types.Object) -> bool:
+    """Return whether an object is a collimator, a crystal or a plane with a projection, and so takes its module along."""
     return item.mphdrr_module.part in collimators.PARTS or _HOME in item
 
 

@@ -43,7 +43,7 @@ def _follow(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph, aim: bool) -
     moved = {item for item in transformed if item.mphdrr_module.is_module and following.has_moved(item)}
     moved |= {item for item in animated if item.mphdrr_module.is_module}
     candidates = scene.objects if _missed_update else transformed
-    displaced = [item for item in candidates if grabbing.is_part(item) and grabbing.is_displaced(item)]
+    displaced = [item for item in candidates if grabbing.is_module_part(item) and grabbing.is_displaced(item)]
     if not (moved or displaced or is_restructured):
         return
     was_missed, _missed_update = _missed_update, _is_busy()
@@ -76,7 +76,7 @@ def after_undo(*_: Any) -> None:
     global _needs_undo_step
     _untidy_after_undo.clear()
     _needs_undo_step = False
-    for item in filter(grabbing.is_part, bpy.data.objects):
+    for item in filter(grabbing.is_module_part, bpy.data.objects):
         if grabbing.is_dragged(item):
             grabbing.finish_drag(item)
         elif grabbing.is_displaced(item):  # the undo step has the camera before it followed: the part goes back
@@ -96,7 +96,7 @@ def after_load(*_: Any) -> None:
     for collection in _local_scanners(bpy.data.collections):
         module_edits.make_single_users(collection)
         if not collection.mphdrr_scanner.parts_free:
-            for item in filter(grabbing.is_part, collection.all_objects):
+            for item in filter(grabbing.is_module_part, collection.all_objects):
                 item.lock_location = item.lock_rotation = (False, False, False)
             collection.mphdrr_scanner.parts_free = True
     after_undo()

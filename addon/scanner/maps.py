@@ -44,10 +44,12 @@ def map_job(
     provenance: dict[str, Any] = {"map": quantity, "modules": len(system), "scanner": collection.name}
 
     def work(progress: Progress) -> StoredVolume:
+        """Compute the map, and store it as a volume."""
         volume = MAPS[quantity](system, grid, progress=progress)
         return store_volume(within_roi(volume, system) if only_roi else volume, folder, provenance=provenance)
 
     def finish(stored: StoredVolume) -> str:
+        """Add the map to the scene, or replace the scanner's map of this quantity, and return the line to report."""
         collection = bpy.data.collections.get(owner)  # None if it has been removed since
         maps = (map_ for map_ in volumes.volume_objects(scene) if volumes.quantity_of(map_) == quantity)
         item = next((map_ for map_ in maps if _belongs_to(map_, collection)), None)

@@ -114,7 +114,7 @@ def _read_or_imported(collection: bpy.types.Collection, camera: bpy.types.Object
 
 
 def _build_parts(collection: bpy.types.Collection, camera: bpy.types.Object) -> Sequence[ModulePart]:
-    """Return a module's parts; raise `InputError` where they cannot be built."""
+    """Return the parts, with their meshes, of which a module consists; raise `InputError` where they cannot be built."""
     construction = pinholes.construction(collection.mphdrr_scanner, module_values.kind_of(collection))
     return _read_or_imported(collection, camera).parts(construction)
 
@@ -236,35 +236,36 @@ def renumber(collection: bpy.types.Collection, order: Literal["RINGS", "LIST"] =
     They are listed, projected and exported in that order from now on. Names that the user gave stay. Raises InputError
     where the scanner is untidy, or its numbers are impossible; it stays as it was.
     """
-    untidy = untidy_text(collection)
-    if untidy:
-        raise InputError(f"scanner '{collection.name}': {untidy}: press Tidy Modules in the Design panel first")
-    system, cameras_ = scanner.read_scanner(collection), scanner.modules(collection)
-    indices = np.arange(len(cameras_))
+    untidy_items = untidy_text(collection)
+    if untidy_items:
+        raise InputError(f"scanner '{collection.name}': {untidy_items}: press Tidy Modules in the Design panel first")
+    system, camera_objects = scanner.read_scanner(collection), scanner.modules(collection)
+    new_order = np.arange(len(camera_objects))
     if order == "RINGS":
-        indices = ring_order(system) if isinstance(system, PinholeSystem) else np.argsort(system.rings(), kind="stable")
-    parts = following.parts_of(collection, cameras_)
-    names: list[tuple[bpy.types.ID, str]] = []
+        rings = system.rings()
+        new_order = ring_order(system) if isinstance(system, PinholeSystem) else np.argsort(rings, kind="stable")
+    module_parts = following.parts_of(collection, camera_objects)
+    new_names: list[tuple[bpy.types.ID, str]] = []
     with following.writing():
-        for index, camera in enumerate(cameras_[m] for m in indices):
+        for index, camera in enumerate(camera_objects[m] for m in new_order):
             camera.mphdrr_module.number, camera.mphdrr_module.index = index + 1, index
-            name = ids.module_name(index + 1, len(cameras_), system.word)
-            names += [(camera, name), (camera.data, name)]
-            for part in parts[camera]:
+            name = ids.module_name(index + 1, len(camera_objects), system.word)
+            new_names += [(camera, name), (camera.data, name)]
+            for part in module_parts[camera]:
                 part.mphdrr_module.number = index + 1
                 part_name = ids.part_name(name, part.mphdrr_module.part)
-                names += [(part, part_name), (part.data, part_name)]
-        ordered = scanner.read_scanner(collection)
-        if np.any(np.diff(indices) < 0):
+                new_names += [(part, part_name), (part.data, part_name)]
+        renumbered = scanner.read_scanner(collection)
+        if np.any(np.diff(new_order) < 0):
             collection.mphdrr_scanner.source = ""  # the workbook's rows are in another order
-        collection.mphdrr_scanner.quick_ranges = json.dumps(scanner.quick_ranges(ordered))
-    names = [(item, name) for item, name in names if item.name != name and _OUR_NAME.fullmatch(item.name)]
-    for item, name in names:
-        item.name = f"{name} renumbered"  # frees the new names
-    for item, name in names:
-        item.name = name
+        collection.mphdrr_scanner.quick_ranges = json.dumps(scanner.quick_ranges(renumbered))
+    renamings = [(data, name) for data, name in new_names if data.name != name and _OUR_NAME.fullmatch(data.name)]
+    for datablock, name in renamings:
+        datablock.name = f"{name} renumbered"  # frees the new names
+    for datablock, name in renamings:
+        datablock.name = name
     following.refresh(collection)
-    return int(np.count_nonzero(system.numbers[indices] != ordered.numbers))
+    return int(np.count_nonzero(system.numbers[new_order] != renumbered.numbers))
 
 
 def has_modules_of(collection: bpy.types.Collection, system: Scanner) -> bool:

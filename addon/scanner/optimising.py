@@ -32,6 +32,7 @@ def optimize_job(scene: bpy.types.Scene, path: Path) -> jobs.Job:
     recipe, live = read_design_recipe(path), _LiveDesign(scene, path.stem)
 
     def work(progress: Progress) -> Design:
+        """Optimise the scanner; return the best design also where the user finishes the search early."""
         try:
             return optimize(recipe, stages_of(progress)("designing"), callback=live.store_best)
         except Cancelled as stop:
@@ -40,6 +41,7 @@ def optimize_job(scene: bpy.types.Scene, path: Path) -> jobs.Job:
             return stop.design  # type: ignore[no-any-return]
 
     def finish(design: Design) -> str:
+        """Show the design in the scene, and return the line to report."""
         collection = live.show(design.system)
         scanner.check_geometry(collection)
         lines, n = design.summary(), len(design.parameters)

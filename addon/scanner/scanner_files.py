@@ -34,6 +34,7 @@ def export_workbook_job(collection: bpy.types.Collection, path: Path, use_templa
     columns, name = source.columns if source is not None else None, collection.name
 
     def work(progress: Progress) -> Scanner:
+        """Write the workbook, read it back to verify it, and return the system with the workbook as its source."""
         stages_of(progress)("writing the workbook")
         written_columns = workbook.write_system(system, path, template, columns).columns
         with recording.recorded_warnings():  # the writer has already warned of the template's doubts
@@ -46,6 +47,7 @@ def export_workbook_job(collection: bpy.types.Collection, path: Path, use_templa
         return system.replace(source=written.source)
 
     def finish(written: Scanner) -> str:
+        """Store that the scene's scanner is that of the workbook, and return the line to report."""
         collection = bpy.data.collections.get(name)
         if collection is not None:
             scanner.store_saved_state(collection, written)
@@ -76,6 +78,7 @@ def export_program_job(
     arguments = {name: value for name, value in options.items() if name in FORMATS[format].options}
 
     def work(progress: Progress) -> None:
+        """Write the geometry in the program's format."""
         stages_of(progress)("writing the file")
         write_geometry(system, path, format, views=views, **arguments)
 

@@ -46,9 +46,11 @@ def voxelize_job(
     provenance = {"meshes": [item.name for item in items], "values": values}
 
     def make(progress: Progress) -> Volume:
+        """Return the volume of the meshes."""
         return voxelize_mesh(solids, grid, values, quantity, progress)
 
     def finish(item: bpy.types.Object, stored: stored_volumes.StoredVolume) -> str:
+        """Return the line to report: the new volume's voxels and its total."""
         content = float(stored.volume.array.sum(dtype=np.float64)) * grid.voxel_volume
         total = f"{content * 1e-3:.4g} kBq" if quantity == "activity" else f"{content:.4g} {UNITS[quantity]} mm^3"
         return f"Added {name!r}: {shape} voxels of {grid.spacing[0]:.3g} mm, {total} in all"
@@ -66,9 +68,11 @@ def mesh_job(item: bpy.types.Object, level: float | None = None) -> jobs.Job:
         level /= volume_materials.display_unit(volumes.quantity_of(item))[1]
 
     def work(progress: Progress) -> Mesh:
+        """Return the mesh of the isosurface."""
         return volume_to_mesh(read(), level, progress)
 
     def finish(mesh: Mesh) -> str:
+        """Add the mesh to the scene, and return the line to report."""
         add_mesh(mesh, name, pose, bpy.context.collection)
         return f"Added {name!r}: {len(mesh.faces)} triangles around {abs(mesh.volume):.4g} mm^3"
 

@@ -47,6 +47,7 @@ def import_job(
     provenance: dict[str, Any] = {"file": names[0]} if count == 1 else {"files": names}
 
     def make(progress: Progress) -> list[Volume]:
+        """Return the volumes of the files, in mu for a photon energy, and centred if asked for."""
         states: list[Volume] = []
         for k, path in enumerate(paths):
             progress(k, count)
@@ -68,6 +69,7 @@ def import_job(
         return states
 
     def finish(item: bpy.types.Object, stored: stored_volumes.StoredVolume) -> str:
+        """Set the first frame of a sequence, and return the line to report."""
         if item.data.is_sequence:
             item.data.frame_start = frame_start
         volume, states = stored.volume, f"{count} states of " if count > 1 else ""
@@ -130,6 +132,7 @@ def _derived_volume_job(
     frame_start, sequence_mode = item.data.frame_start, item.data.sequence_mode
 
     def make(progress: Progress) -> list[Volume]:
+        """Return the volume that `derive` makes of each state."""
         states: list[Volume] = []
         for number, read in enumerate(readers):
             progress(number, count)
@@ -137,6 +140,7 @@ def _derived_volume_job(
         return states
 
     def finish(result: bpy.types.Object, stored: stored_volumes.StoredVolume) -> str:
+        """Let the new volume play its states as the old one does, and return the line to report."""
         result.data.frame_start, result.data.sequence_mode = frame_start, sequence_mode
         return f"Added {result.name!r}: {volumes.values_text(stored)}{note}"
 

@@ -67,11 +67,13 @@ def add_volume_job(
     folder, collection_uid = storage.folder(), 0 if collection is None else collection.session_uid
 
     def work(progress: Progress) -> StoredVolume:
+        """Make the volume and store its voxels."""
         volume = make(progress)
         stages_of(progress)("writing the voxels")
         return store_volume(volume, folder, pose, provenance)
 
     def finished(stored: StoredVolume) -> str:
+        """Add the volume to the scene, make it active, and return the line of `finish`."""
         item = add_stored(stored, name, jobs.find_by_uid(bpy.data.collections, collection_uid))
         make_active(bpy.context, item)
         return finish(item, stored)

@@ -206,13 +206,15 @@ class DesignRecipe(Values):
     @cached_property
     def fingerprint(self) -> str:
         """SHA-256 of all entries that determine the design, and of the contents of the files that they name."""
-        irrelevant = ("pareto.", "evaluation.")
-        entries = sorted((key, value) for key, value in self.given.items() if not key.startswith(irrelevant))
-        goals = [goal for goal in self.goals.values() if "parts" in goal.rows]
-        bodies = [text for goal in goals for text in (*goal["body"], goal["parts"])]
-        files = [text for text in (self.generator.get("file"), *bodies) if text and "\n" not in text]
-        data = [read_bytes(self.folder / name) for name in files]
-        return hashlib.sha256(repr((entries, self.generator, self.free, self.objectives, data)).encode()).hexdigest()
+        # The tables pareto and evaluation do not change the design.
+        entries = sorted(entry for entry in self.given.items() if not entry[0].startswith(("pareto.", "evaluation.")))
+        image_goals = [goal for goal in self.goals.values() if "parts" in goal.rows]
+        # A phantom is given by its text, or by the name of its file.
+        phantoms = [phantom for goal in image_goals for phantom in (*goal["body"], goal["parts"])]
+        file_names = [name for name in (self.generator.get("file"), *phantoms) if name and "\n" not in name]
+        contents = [read_bytes(self.folder / name) for name in file_names]
+        content = repr((entries, self.generator, self.free, self.objectives, contents))
+        return hashlib.sha256(content.encode()).hexdigest()
 
 
 def design_recipe(values: Mapping[str, Any], folder: Path = Path()) -> DesignRecipe:

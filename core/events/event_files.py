@@ -105,7 +105,7 @@ def pack(event: EventArrays, recipe: EventRecipe, geometry: dict[str, Any], thre
         **{f"geometry/{name}": value for name, value in geometry.items()},
     }  # fmt: skip
 
-    def fill(file: Any) -> None:
+    def write_contents(file: Any) -> None:
         """Write all attributes and datasets of the event into an open HDF5 file."""
         file.attrs.update({
             "format": _KIND, "format_version": VERSION, "conventions": CONVENTIONS, "recipe_sha256": recipe.fingerprint,
@@ -124,7 +124,9 @@ def pack(event: EventArrays, recipe: EventRecipe, geometry: dict[str, Any], thre
             _write_dataset(file, name, images, recipe["storage.images"], (1, *images.shape[1:]), pool, {"unit": unit})
 
     with ThreadPoolExecutor(threads or cores()) as pool:
-        return hdf5.pack(_KIND, {"event": str(planned.number), "recipe": recipe.fingerprint, "build": build()}, fill)
+        return hdf5.pack(
+            _KIND, {"event": str(planned.number), "recipe": recipe.fingerprint, "build": build()}, write_contents
+        )
 
 
 def _write_truth(file: Any, truth: Volume, recipe: EventRecipe, pool: ThreadPoolExecutor) -> None:

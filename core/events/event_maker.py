@@ -95,6 +95,7 @@ class EventMaker:
         n_done, n_steps = 0, 1 + len(recipe.models) + (0 if recipe.radon is None else len(recipe.radon.counts))
 
         def step() -> None:
+            """Report one further finished stage of the event."""
             nonlocal n_done
             n_done += 1
             tell(progress, n_done, n_steps)

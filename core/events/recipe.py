@@ -243,6 +243,7 @@ class EventRecipe:
 
     @cached_property
     def _read_inputs(self) -> dict[str, Input]:
+        """Files of the recipe that have been read so far, by their names in the recipe."""
         return {}
 
     def _model_recipe(self, entries: dict[str, Any]) -> Recipe:
@@ -268,6 +269,7 @@ class EventRecipe:
         """Return the recipe's tables with every file name replaced by ``replace(name, content)``; see `Input.content`."""
 
         def replaced(value: Any, content: str) -> Any:
+            """Return a file's name, or a draw of `one_of` several names, with every name replaced."""
             if isinstance(value, str):
                 return replace(value, content)
             return {**value, "one_of": [replaced(option, content) for option in value["one_of"]]}

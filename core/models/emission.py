@@ -237,6 +237,7 @@ class Emission(Model):
         return replace(self, hole="rays") if self.hole == "auto" else self
 
     def _set(self, name: str, value: Any) -> None:
+        """Set an attribute of this frozen dataclass."""
         object.__setattr__(self, name, value)
 
     def _set_optics(self) -> None:
@@ -267,6 +268,7 @@ class Emission(Model):
 
     @cached_property
     def _models(self) -> tuple[Model, ...]:
+        """The models whose images add up to this model's, see `parts`."""
         return line_models(self, self.photon_lines) if self.is_apart else models_with_walls(self)
 
     def record(self) -> dict[str, Any]:
@@ -331,6 +333,7 @@ class Emission(Model):
 
     @cached_property
     def _frames(self) -> Floats:
+        """The modules' frames (M, 3, 3), with rows u, v, k."""
         return self.system.frames()
 
     @property
@@ -356,6 +359,7 @@ class Emission(Model):
         n = self.pixel_points_needed(views, m, grid)
 
         def weights(points: Floats, opening: Opening, layer: int, rows: slice, columns: slice, shifts: slice) -> Floats:
+            """Return the weights of the chosen pixels' rays, averaged over the `points` of a pixel."""
             points_u, points_v = points[shifts].T[:, :, None, None]
             u_ends, v_ends = pixels_u[:, columns] + points_u, pixels_v[rows] + points_v
             return self.pixel_weights(m, u_ends, v_ends, (pitch_u, pitch_v), l, opening, layer, n * len(openings)) / n
@@ -435,6 +439,7 @@ class Emission(Model):
         lengths = self.system.collimator_length + [module.mean_depth for module in effects]
 
         def ray_weight(m: int, *, u: Floats, v: Floats) -> Floats:
+            """Return the expected counts per mm^2 of crystal of module m's rays to (v, u), mm from the hole's foot."""
             (opening,) = plain.openings(m, 1)
             # The law depends on u^2 + v^2 alone; in the order v, u the sum has the last digit of earlier versions.
             return plain.pixel_weights(m, v, u, (1.0, 1.0), float(lengths[m]), opening)
@@ -484,6 +489,7 @@ class Emission(Model):
         return self._optics_of(m).openings(self.system.pinhole_diameter[m], n)
 
     def _optics_of(self, m: int) -> Optics:
+        """Return the optics of module m."""
         return self.optics.of_modules(m, len(self.system))
 
     def _crystal_scale(self, views: Views, m: int) -> float:

@@ -217,7 +217,10 @@ class _LatticeMap(LinearOperator):
 
     @abstractmethod
     def adjoint(self, y: Array, progress: Progress | None) -> Array:
-        """Return the adjoint map of an array of float32 or float64 on the target lattice."""
+        """Return the adjoint of this map applied to `y` on the target lattice: an array on the source lattice.
+
+        Both are of one type, float32 or float64.
+        """
 
 
 def _run(function: _Map, x: ArrayOrTensor, shape: tuple[int, int, int], progress: Progress | None) -> ArrayOrTensor:

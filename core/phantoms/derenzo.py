@@ -49,6 +49,7 @@ class DerenzoRods(Shape):
     KIND = "derenzo_rods"
 
     def _check(self) -> None:
+        """Check radius, height, sectors and rod diameters, and set the size of the rods' bounding cylinder."""
         for name in ("radius", "height"):
             self._set(name, positive(getattr(self, name), f"Derenzo {name}", "mm"))
         if isinstance(self.sectors, bool) or not isinstance(self.sectors, int) or self.sectors < 2:
@@ -193,6 +194,7 @@ class DerenzoRods(Shape):
         return np.maximum(abs(along - t), abs(across - s)) < w / 2
 
     def _intervals(self, starts: Floats, directions: Floats) -> Interval:
+        """Return where the lines, `starts` (3, N) and `directions` (3, N), enter and leave each rod."""
         intervals = [
             Cylinder(radius=w / 2, height=self.height, activity=0.0).intervals(starts - [[x], [y], [0.0]], directions)
             for _, x, y, w in self.rods
@@ -201,6 +203,7 @@ class DerenzoRods(Shape):
         return np.concatenate(enter), np.concatenate(leave)
 
     def _surface(self) -> Surface:
+        """Return the closed surface of all rods."""
         radii, half = np.array([0.0, 0.5, 0.5, 0.0]), self.height / 2
         rod, faces = revolve_profile(radii, np.array([-half, -half, half, half]), 1.0, 1.0, n_sides=24)
         _, x, y, w = self.rods.T[:, :, None]

@@ -47,7 +47,7 @@ class Layer:
     """Shape of a painting with its pose world-from-shape (4, 4), mm, and its value, an activity or a mu."""
 
     shape: Shape
-    pose: Points
+    pose: Floats
     value: float
 
     @property
@@ -56,7 +56,7 @@ class Layer:
         return self.shape.mode == "add"
 
     @cached_property
-    def from_world(self) -> Points:
+    def from_world(self) -> Floats:
         """Inverse of the pose, shape-from-world (4, 4)."""
         return np.linalg.inv(self.pose)
 

@@ -53,6 +53,7 @@ def counted_lines(isotope: Isotope, window: Window, energy_fwhm: float | None = 
     reference, _ = max(lines, key=lambda line: line[1])
 
     def fwhm(energy: float) -> float:
+        """Return the energy resolution at an energy, FWHM in keV."""
         return energy_fwhm * math.sqrt(reference * energy)
 
     counted = [(energy, n * acceptance(energy, window, fwhm(energy))) for energy, n in sorted(isotope.lines)]
@@ -74,6 +75,7 @@ def peak_shares(isotope: Isotope, windows: Sequence[Window | None], energy_fwhm:
     total = sum(photons for _, photons in lines)
 
     def share(window: Window | None) -> float:
+        """Return the share of the lines' photons that a window counts, 0 for no window."""
         blurred = ((e, photons, energy_fwhm * math.sqrt(reference * e)) for e, photons in lines)
         return 0.0 if window is None else sum(n * acceptance(e, window, fwhm) for e, n, fwhm in blurred) / total
 

@@ -60,6 +60,7 @@ def resolution_map(
     optics = chosen_optics(optics, settings)
 
     def combined_fwhm(points: Floats) -> Floats:
+        """Return the FWHM (N,), mm, of all modules' projections together at `points` (N, 3), world mm."""
         fwhm, counts = resolution(system, points, optics=optics), sensitivity(system, points, optics=optics)
         total = counts.sum(axis=1)
         return np.sqrt((counts * np.nan_to_num(fwhm) ** 2).sum(axis=1) / np.where(total > 0, total, 1))
@@ -77,6 +78,7 @@ def completeness_map(
     """
 
     def completeness(points: Floats) -> Floats:
+        """Return the completeness (N,) at `points` (N, 3), world mm."""
         return 1 - sampling_gaps(system, points, tolerance=tolerance) / (math.pi / 2)
 
     return _map(system, grid, "completeness", completeness, progress)
@@ -103,6 +105,7 @@ def _map(
     size = max(1, _BLOCK // len(system))
 
     def fill(first: int) -> None:
+        """Compute the map's values in the block of voxels that starts at index `first`."""
         voxels = np.arange(first, min(first + size, grid.n_voxels))
         index = np.stack(np.unravel_index(voxels, grid.shape), axis=1)
         values[voxels] = value(moved(grid.affine, index))

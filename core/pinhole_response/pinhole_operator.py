@@ -72,6 +72,7 @@ class PinholeOperator(PinholeViews):
         filled, dtype = np.ascontiguousarray(filled), volume.dtype.type
 
         def image(m: int) -> Array:
+            """Return the image (n_v, n_u) of view m."""
             image = np.zeros(self.views.shape, volume.dtype)
             responses = self._box_responses(m, origin, filled.shape, dtype)
             transmittance = self._transmittance(m, origin, filled, mu) if responses else None
@@ -95,6 +96,7 @@ class PinholeOperator(PinholeViews):
         box = (0, 0, 0), self.grid.shape, images.dtype.type
 
         def to_cells(m: int) -> tuple[Array | None, list[tuple[DepthResponse, Array]]]:
+            """Return the voxels' transmittance in view m, and its image shared out to the cells of each response."""
             responses = self._box_responses(m, *box)
             cells = [(response, backend.pixels_to_cells(images[m][pixels], response)) for response, pixels in responses]
             return self._transmittance(m, box[0], volume, mu) if cells else None, cells
@@ -106,6 +108,7 @@ class PinholeOperator(PinholeViews):
             views = list(in_order(to_cells, range(first, last), workers))
 
             def to_voxels(slab: slice, views: list[Any] = views) -> None:
+                """Add the cells of these `views` to the voxels of a slab of the volume."""
                 for transmittance, responses in views:
                     for response, cells in responses:
                         backend.cells_to_voxels(volume, cells, response, transmittance, slab)
@@ -138,6 +141,7 @@ class PinholeOperator(PinholeViews):
         shape, affine = filled[0].shape, self.grid.affine[:3]
 
         def view_gradient(m: int) -> tuple[Array, Array, ViewNumbers]:
+            """Return the gradients of view m by the pinhole's centre (3,), the frame (3, 3) and the view's numbers."""
             pinhole, frame, *_ = self.module(m)
             numbers = ViewNumbers.zero()
             d_transmittance: Array = np.zeros(shape, dtype)
@@ -176,6 +180,7 @@ class PinholeOperator(PinholeViews):
         filled = np.ascontiguousarray(filled)
 
         def view_gradient(m: int) -> Array:
+            """Return the gradient of view m by mu, on mu's grid."""
             d_transmittance = np.zeros_like(filled)
             for response, pixels in self._box_responses(m, origin, filled.shape, volume.dtype.type):
                 cells = backend.pixels_to_cells(np.ascontiguousarray(images[m][pixels]), response)

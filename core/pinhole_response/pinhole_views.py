@@ -159,6 +159,7 @@ class PinholeViews:
         node_spacing = 1 if effects is None else _node_spacing(effects, widths[0], float(np.abs(pitch).max()), l)
 
         def point_weight(*, u: Array, v: Array) -> Array:
+            """Return `ray_weight` of view m times sec(angle), for crystal points (v, u), mm."""
             return np.asarray(self.ray_weight(m, u=u, v=v) * np.sqrt(1 + (u**2 + v**2) / l**2))
 
         return DepthZone(numbers, self.views.shape, point_weight, float(self.crystal_sides[m]), self.grid.voxel_volume,

@@ -141,6 +141,7 @@ def matrix_gradient(
     scale = np.concatenate([np.repeat(np.abs(response.matrix[:, :3]).max(axis=1), 4), np.abs(numbers[12:])])
 
     def total(numbers: Array) -> float:
+        """Return the sum of `volume` times the adjoint of `cells`; `numbers` (15,): the matrix, then the line."""
         matrix = numbers[:12].reshape(3, 4)
         moved = replace(response, matrix=matrix, depth_line=np.linalg.solve(matrix[:, :3], numbers[12:]))
         return float((voxels_to_cells(volume, moved, transmittance) * cells).sum())

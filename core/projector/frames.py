@@ -76,10 +76,12 @@ class FrameProjector(LinearOperator):
         return replace(self._model, time=self.times[f], start=self.starts[f])
 
     def _run_one(self, x: ArrayOrTensor, progress: Progress | None = None, mu: ArrayOrTensor = None) -> ArrayOrTensor:
+        """Return the images (F, M, n_v, n_u) of the frames' volumes (F, n_x, n_y, n_z)."""
         images = self._A._run(x, progress, mu)
         return images * cast_like(self._count_ratios, images)
 
     def _run_back(self, y: ArrayOrTensor, progress: Progress | None = None, mu: ArrayOrTensor = None) -> ArrayOrTensor:
+        """Return the adjoint (F, n_x, n_y, n_z) of the frames' images (F, M, n_v, n_u)."""
         return self._A.T._run(y * cast_like(self._count_ratios, y), progress, mu)
 
 

@@ -164,15 +164,18 @@ class Projector(LinearOperator):
             return self._apply(x, progress, mu)
         from ..rays import autograd
 
-        def run(needs: Any) -> Any:
-            def gradients(images: ArrayOrTensor, needs: Any) -> Any:
+        def images_and_gradient(_needs: Any) -> Any:
+            """Return the images, and the function that turns their gradient into those of `x` and `mu`."""
+
+            def input_gradients(d_images: ArrayOrTensor, needs: Any) -> Any:
+                """Return the gradients by `x` and by `mu` of a loss with the gradient `d_images` by the images."""
                 needs_x, needs_mu = needs
-                d_x = self.T._run(images, mu=mu) if needs_x else None
-                return d_x, self._mu_gradient(images, x, mu) if needs_mu else None
+                d_x = self.T._run(d_images, mu=mu) if needs_x else None
+                return d_x, self._mu_gradient(d_images, x, mu) if needs_mu else None
 
-            return self._run(x.detach(), progress, mu.detach()), gradients
+            return self._run(x.detach(), progress, mu.detach()), input_gradients
 
-        return autograd.step(run, x, mu)
+        return autograd.step(images_and_gradient, x, mu)
 
     @property
     def backend(self) -> str:
@@ -230,6 +233,7 @@ class Projector(LinearOperator):
         return f"Projector({voxels} voxels, {len(self.views)} views of {pixels}, {self.backend})"
 
     def _check(self, x: Volume | ArrayOrTensor, batch: bool = True) -> ArrayOrTensor:
+        """Return the checked array of a volume; warn if its values seem to be CT numbers."""
         if isinstance(x, Volume):
             if not same_lattice(x.grid, self.grid):
                 actual, expected = map(_describe, (x.grid, self.grid))
@@ -245,6 +249,7 @@ class Projector(LinearOperator):
         return array
 
     def _run_one(self, x: ArrayOrTensor, progress: Progress | None = None, mu: ArrayOrTensor = None) -> ArrayOrTensor:
+        """Return the images (M, n_v, n_u) of a checked volume (n_x, n_y, n_z), with `mu` in place of the model's."""
         n_views, n_v, n_u = self.shape_out
         itemsize = 8 if self._float64 or is_double(x) else 4
         work = f"projecting {shape_text(self.shape_in)} voxels into {n_views} images of {n_v} x {n_u} pixels"
@@ -260,6 +265,7 @@ class Projector(LinearOperator):
         return to_caller(images, x)
 
     def _run_back(self, y: ArrayOrTensor, progress: Progress | None = None, mu: ArrayOrTensor = None) -> ArrayOrTensor:
+        """Return the adjoint (n_x, n_y, n_z) of checked images (M, n_v, n_u), with `mu` in place of the model's."""
         if self._parts:
             n = len(self._parts)
             return sum(A._run_back(y, part_of(progress, k, n), mu) for k, A in enumerate(self._parts))

@@ -71,7 +71,8 @@ def depth_images(
     attenuation: Any = mu.array if isinstance(mu, Volume) else mu
     mu_grid = mu.grid if isinstance(mu, Volume) else mu_grid or grid
 
-    def run(needs: Any) -> Any:
+    def images_and_gradient(needs: Any) -> Any:
+        """Return the images, and the function that turns their gradient into those of the inputs."""
         dtype = np.float64 if is_double(array) or is_double(positions) else np.float32
         voxels, mu_on_grid = to_numpy(array, dtype), None
         if attenuation is not None:
@@ -81,7 +82,8 @@ def depth_images(
         backend, threads = depth_backend(), thread_count(None)
         images = np.stack(list(A.images(voxels, backend, threads, None))).reshape(*batch, *shape)
 
-        def gradients(gradient: Tensor, needs: Any) -> list[Tensor | None]:
+        def input_gradients(gradient: Tensor, needs: Any) -> list[Tensor | None]:
+            """Return the gradients by the inputs that need one, None for the others."""
             weights = to_numpy(gradient, dtype).reshape(-1, *shape)
             arrays: list[Any] = [None] * 8
             if needs[0]:
@@ -95,10 +97,10 @@ def depth_images(
                 for values, tensor, need in zip(arrays, (array, attenuation, *inputs), needs, strict=True)
             ]
 
-        return torch.from_numpy(images).to(positions), gradients
+        return torch.from_numpy(images).to(positions), input_gradients
 
     inputs = *cameras[:3], effective_diameter, cameras.pitch, cameras.offset
-    return autograd.step(run, array, attenuation, *inputs) * factors[..., None, None]
+    return autograd.step(images_and_gradient, array, attenuation, *inputs) * factors[..., None, None]
 
 
 def _without_directional_effects(optics: Optics) -> Optics:
@@ -116,6 +118,7 @@ def _pinhole_operator(
     n = len(views)
 
     def to_array(number: Tensor, *last: int) -> Any:
+        """Return the cameras' numbers as an array (M, *last) of float64."""
         return number.numpy(force=True).astype(np.float64).reshape(n, *last)
 
     sides = np.full(n, np.inf) if cameras.crystal_side is None else to_array(cameras.crystal_side)
@@ -128,6 +131,7 @@ def _pinhole_operator(
     lengths = to_array(cameras.length) + [camera.mean_depth for camera in effects]
 
     def ray_weight(m: int, *, u: Any, v: Any) -> Any:
+        """Return the expected counts per mm^2 of crystal of the rays of camera m to (v, u), mm."""
         camera = plain.of_modules(m, n)
         (opening,) = camera.openings(diameter[m])
         return camera.pixel_weights((u, v), (1.0, 1.0), lengths[m], np.inf, thickness[m], opening)

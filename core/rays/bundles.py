@@ -149,8 +149,7 @@ class Bundles:
     """
 
     def __init__(self, n: int, make: Callable[[int], RayBundle]) -> None:
-        self._n = n
-        self._make = make
+        self._n, self._make = n, make
         self._bundles: dict[int, RayBundle] = {}
         self._batches: dict[tuple[Any, ...], list[Batch]] = {}
         self._free_bytes = STORED_BYTES

@@ -70,12 +70,14 @@ class Execution:
         forward = self.backend.functions.forward
 
         def run(task: _Task) -> _Task:
+            """Add the integrals of a task's rays to its result, and return the task."""
             for batch in self._batches(task, bundles):
                 integrals = forward(lattices.volume, *batch.in_index_space(lattices))
                 batch.add_to(task.result, task.images.start, integrals)
             return task
 
         def tasks() -> Iterator[_Task]:
+            """Yield the tasks; those of the same images share one array for the result."""
             result = None
             for task in self._tasks(bundles, lattices, self.workers):
                 if result is None:
@@ -97,6 +99,7 @@ class Execution:
         derivatives = self.backend.functions.derivatives
 
         def run(task: _Task) -> list[tuple[Batch, Floats]]:
+            """Return the batches of a task with their derivatives, and add their integrals to the images."""
             results = []
             for batch in self._batches(task, bundles):
                 rows = to_caller(derivatives(lattices.volume, *batch.in_index_space(lattices)), np.empty(0)).T
@@ -127,6 +130,7 @@ class Execution:
         add_gradient = self.backend.functions.mu_gradient
 
         def add(gradient: ArrayOrTensor, *values_and_rays: Any) -> None:
+            """Add the gradient by mu of a batch of rays to `gradient`."""
             add_gradient(gradient, lattices.volume, *values_and_rays)
 
         return self._accumulated(add, self.mu_grid or self.grid, images, bundles, lattices, None)
@@ -140,6 +144,7 @@ class Execution:
         for tasks in self._rounds(bundles, lattices, workers):
 
             def work(worker: int, tasks: list[_Task] = tasks) -> None:
+                """Add the batches of every `workers`-th task to the volume of this worker."""
                 # A volume gets the same batches in the same order each time, so the result is the same each time.
                 for task in tasks[worker::workers]:
                     for batch in self._batches(task, bundles):

@@ -124,7 +124,9 @@ class Adjoint(LinearOperator):
         return f"{self._operator!r}.T"
 
     def _run_one(self, x: ArrayOrTensor, progress: Progress | None = None, mu: ArrayOrTensor = None) -> ArrayOrTensor:
+        """Return the adjoint of the operator applied to `x`."""
         return self._operator._run_back(x, progress, mu)
 
     def _run_back(self, y: ArrayOrTensor, progress: Progress | None = None, mu: ArrayOrTensor = None) -> ArrayOrTensor:
+        """Return the operator itself applied to `x`: the adjoint of the adjoint."""
         return self._operator._run_one(y, progress, mu)

@@ -67,6 +67,7 @@ def sum_volumes(volumes: list[ArrayOrTensor], workers: int) -> ArrayOrTensor:
     size = -(-len(total) // len(volumes))
 
     def add(first: int) -> None:
+        """Add up the stretch of all volumes that begins at the flat index `first`."""
         for addend in addends:
             total[first : first + size] += addend[first : first + size]
 

@@ -127,9 +127,11 @@ def trace_fans(
     numbers = _numbers(vectors, "vectors", (4, 3), is_tensor(array) or is_tensor(vectors))
 
     def bundles(vectors: Floats) -> Bundles:
+        """Return the bundles of rays of the fans' vectors."""
         fans = vectors.reshape(-1, 4, 3)
 
         def bundle(number: int) -> RayBundle:
+            """Return the rays of fan `number`."""
             source, corner, row_step, column_step = fans[number]
             return RayBundle.along(execution.grid, Beam(Fan(source, corner, row_step, column_step, shape)))
 
@@ -202,11 +204,12 @@ def _trace(
     """
     dtype = np.float64 if execution.float64 else np.float32
 
-    def images(bundles: Bundles, volume: Any, mu: Any) -> Floats:
+    def project(bundles: Bundles, volume: Any, mu: Any) -> Floats:
+        """Return the line integrals (images, rows, columns) as an array of `dtype`."""
         return np.array([to_caller(image, np.empty(0)) for image in execution.images(volume, bundles, mu)], dtype)
 
     if not is_tensor(geometry):
-        return images(make_bundles(geometry), volume, mu)
+        return project(make_bundles(geometry), volume, mu)
     import torch
 
     from . import autograd
@@ -214,17 +217,19 @@ def _trace(
     bundles = make_bundles(geometry.numpy(force=True))
     volume_data, mu_data = (x.detach() if is_tensor(x) else x for x in (volume, mu))
 
-    def run(needs: Any) -> Any:
+    def integrals_and_gradient(needs: Any) -> Any:
+        """Return the line integrals, and the function that turns their gradient into those of volume, mu and geometry."""
         batches: list[tuple[Batch, Floats]] = []
         if needs[2]:
             integrals = np.zeros((len(bundles), *bundles.image_shape), dtype)
             batches = execution.derivatives(volume_data, bundles, mu_data, integrals)
         else:
-            integrals = images(bundles, volume_data, mu_data)
+            integrals = project(bundles, volume_data, mu_data)
         if not np.isfinite(integrals).all():
             require_finite(to_caller(volume_data, integrals), "volume")
 
-        def gradients(gradient: Tensor, needs: Any) -> list[Tensor | None]:
+        def input_gradients(gradient: Tensor, needs: Any) -> list[Tensor | None]:
+            """Return the gradients by volume, mu and geometry where they are needed, None for the others."""
             result: list[Tensor | None] = [None, None, None]
             if needs[0] or needs[1]:
                 values = gradient.to(volume_data)  # the torch backend works on the device of the values
@@ -237,9 +242,9 @@ def _trace(
                 result[2] = torch.from_numpy(d_geometry).reshape(geometry.shape)
             return result
 
-        return torch.from_numpy(integrals), gradients
+        return torch.from_numpy(integrals), input_gradients
 
-    return autograd.step(run, volume, mu, geometry)
+    return autograd.step(integrals_and_gradient, volume, mu, geometry)
 
 
 def _rays_gradient(

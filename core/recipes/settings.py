@@ -81,21 +81,21 @@ class Setting:
     @property
     def help(self) -> str:
         """Description with unit, words and the consequence of leaving the setting out."""
-        words = f"one of {', '.join(self.words)}" if self.words else ""
-        text = ", ".join(filter(None, (self.text, self.unit, words)))
-        return text + (f"; without it, {self.absent}" if self.absent else "")
+        words_text = f"one of {', '.join(self.words)}" if self.words else ""
+        description = ", ".join(filter(None, (self.text, self.unit, words_text)))
+        return description + (f"; without it, {self.absent}" if self.absent else "")
 
     @property
     def expected(self) -> str:
         """Description of one allowed value, for messages after "expected"."""
-        files = f"a file ({', '.join(self.endings)})" if self.endings else ""
-        words = " or ".join(filter(None, (f"one of {', '.join(self.words)}" if self.words else "", files)))
+        file_text = f"a file ({', '.join(self.endings)})" if self.endings else ""
+        choices_text = " or ".join(filter(None, (f"one of {', '.join(self.words)}" if self.words else "", file_text)))
         if self.kind in (bool, str):
-            return words or {bool: "true or false", str: "a text"}[self.kind]
-        number = "a whole number" if self.kind is int else "a number"
+            return choices_text or {bool: "true or false", str: "a text"}[self.kind]
+        number_text = "a whole number" if self.kind is int else "a number"
         bounds = {"of {:g} or more": self.least, "above {:g}": self.above, "and at most {:g}": self.most}
-        number += "".join(" " + text.format(bound) for text, bound in bounds.items() if bound is not None)
-        return " or ".join(filter(None, (words, number + (f" ({self.unit})" if self.unit else ""))))
+        number_text += "".join(" " + form.format(bound) for form, bound in bounds.items() if bound is not None)
+        return " or ".join(filter(None, (choices_text, number_text + (f" ({self.unit})" if self.unit else ""))))
 
     def checked(self, value: Any) -> Any:
         """Return `value` as a recipe keeps it, lists as tuples; raise `InputError` if it is not allowed."""

@@ -85,6 +85,7 @@ def is_met(values: Mapping[str, Any], need: str, rows: Mapping[str, Setting]) ->
     """
 
     def holds(term: str) -> bool:
+        """Return whether one term of the condition is met."""
         key, _, word = term.partition("=")
         if word and rows[key].names_file(values.get(key)):
             return True

@@ -122,6 +122,7 @@ def bsrem(
         return result
 
     def step(number: int, x: Array, progress: Progress | None) -> tuple[Array, float]:
+        """Return the next volume after `x`, and its objective, in iteration `number`."""
         halvings = int(loop.state.get("halvings", np.zeros(()))[()])
         scale = sensitivity if penalty is None else sensitivity + (x + lift) * penalty.curvature(x)
         last_objective, smallest_gain = -np.inf, 0.0

@@ -116,6 +116,7 @@ def _em(loop: CountLoop) -> Reconstruction:
     bounded_share = 0.0  # largest share of the voxels in which the prior pulls the divisor below its lower bound
 
     def step(number: int, x: Array, progress: Progress | None) -> tuple[Array, float]:
+        """Return the next volume after `x`, and its objective, in iteration `number`."""
         nonlocal bounded_share
         for k, s in enumerate(access_order(n)):
             projector, data = loop.subsets[s]

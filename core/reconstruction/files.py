@@ -27,15 +27,16 @@ def write_reconstruction(result: Reconstruction, path: AnyPath) -> None:
     require_ending(path, _ENDINGS)
     instance(result, Reconstruction, "write_reconstruction")
 
-    def fill(file: Any) -> None:
-        hdf5.fill(result.volume, file)
+    def write_contents(file: Any) -> None:
+        """Write the volume and everything that is needed to resume into an open ``h5py.File``."""
+        hdf5.write_datasets(result.volume, file)
         group = file.create_group(_GROUP)
         group.attrs.update(format_version=_FORMAT_VERSION, settings=json.dumps(dict(result.settings)))
         group["objective"] = result.objective
         for name, array in result.state.items():
             group[f"state/{name}"] = array
 
-    write_bytes(path, pack("mphDRR reconstruction", {}, fill))
+    write_bytes(path, pack("mphDRR reconstruction", {}, write_contents))
 
 
 def read_reconstruction(path: AnyPath) -> Reconstruction:

@@ -117,6 +117,7 @@ def filtered_backprojection(
         end = min(first + batch, n)
 
         def filter_view(m: int, first: int = first) -> None:
+            """Store the weighted image of view m with its rows filtered."""
             filtered[m - first] = (images[m] * weights(m)).astype(np.float32, copy=False) @ matrix
 
         run_all(filter_view, range(first, end), thread_count(None))

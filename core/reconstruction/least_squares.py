@@ -81,6 +81,7 @@ def sirt(
     residual: Array | None = None
 
     def step(number: int, x: Array, progress: Progress | None) -> tuple[Array, float]:
+        """Return the next volume after `x`, and its objective, in iteration `number`."""
         nonlocal residual
         if residual is None:
             residual = loop.images - loop.forward(x, fixed_progress(progress, 0, 2))
@@ -133,6 +134,7 @@ def cgls(
     loop = LeastSquaresLoop("CGLS", A, images, iterations, False, *options, **named)
 
     def step(number: int, x: Array, progress: Progress | None) -> tuple[Array, float]:
+        """Return the next volume after `x`, and its objective, in iteration `number`."""
         if not loop.state:
             residual: Array = loop.images - loop.forward(x, fixed_progress(progress, 0, 2))
             direction = loop.adjoint(residual, fixed_progress(progress, 0, 2))

@@ -197,6 +197,7 @@ class Loop:
             raise InputError(f"start: this reconstruction is of {difference}: {advice}")
 
     def _result(self, settings: Mapping[str, Any], stopped: str) -> Reconstruction:
+        """Return the reconstruction of the current values, with `settings` and the reason why it `stopped`."""
         volume = Volume(self.values, self._A.grid, self._quantity)
         settings = {"method": self._method, **settings, "iterations": self.n_done, "stopped": stopped}
         return Reconstruction(volume, np.array(self._objective), settings, dict(self.state))

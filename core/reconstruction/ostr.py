@@ -84,6 +84,7 @@ def ostr(
     penalty = make_penalty(prior, A.grid, visible)
 
     def step(number: int, x: Array, progress: Progress | None) -> tuple[Array, float]:
+        """Return the next volume after `x`, and its objective, in iteration `number`."""
         for k, s in enumerate(access_order(n)):
             projector, subset_progress = projectors[s], fixed_progress(progress, k, n + 1)
             measured = counts[projector.which]

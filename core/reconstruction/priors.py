@@ -161,13 +161,16 @@ class Quadratic(Prior):
     """Quadratic penalty on differences, ``psi = (x_j - x_k)^2 / 2``, which smooths noise and edges alike."""
 
     def _psi(self, a: Array, b: Array) -> Array:
+        """Return psi = (a - b)^2 / 2 of neighbouring values."""
         return np.square(a - b) / 2
 
     def _first_derivatives(self, a: Array, b: Array) -> tuple[Array, Array]:
+        """Return d psi / da and d psi / db."""
         difference = a - b
         return difference, -difference
 
     def _second_derivatives(self, a: Array, b: Array) -> tuple[Any, Any]:
+        """Return d^2 psi / da^2 and d^2 psi / db^2."""
         return np.ones_like(a), np.ones_like(a)
 
 
@@ -203,7 +206,7 @@ class RelativeDifference(Prior):
         object.__setattr__(self, "edge", positive(self.edge, "prior: edge", "kBq/mL"))
 
     def _fraction(self, a: Array, b: Array) -> tuple[Array, Array]:
-        """Return the difference a - b and the denominator of psi."""
+        """Return the difference a - b and psi's denominator, a + b + gamma |a - b| + edge."""
         difference = a - b
         denominator = np.abs(difference)
         denominator *= self.gamma
@@ -213,10 +216,12 @@ class RelativeDifference(Prior):
         return difference, denominator
 
     def _psi(self, a: Array, b: Array) -> Array:
+        """Return psi of neighbouring values a and b."""
         difference, denominator = self._fraction(a, b)
         return difference * difference / denominator
 
     def _first_derivatives(self, a: Array, b: Array) -> tuple[Array, Array]:
+        """Return d psi / da and d psi / db."""
         difference, denominator = self._fraction(a, b)
         ratio = difference / denominator
         # With D the denominator, d psi/da = (a - b) (D + 2 b + edge) / D^2; d psi/db is its negative with a and b exchanged.
@@ -229,6 +234,7 @@ class RelativeDifference(Prior):
         return d_a, np.negative(d_b, out=d_b)
 
     def _second_derivatives(self, a: Array, b: Array) -> tuple[Any, Any]:
+        """Return d^2 psi / da^2 and d^2 psi / db^2."""
         cube = self._fraction(a, b)[1] ** 3
         return 2 * np.square(2 * b + self.edge) / cube, 2 * np.square(2 * a + self.edge) / cube
 
@@ -303,6 +309,7 @@ class Penalty:
         values = np.zeros(len(self._slabs()))
 
         def work(slab: tuple[int, int, int]) -> None:
+            """Add a slab's part of the penalty's value."""
             number, first, end = slab
             values[number] = self._prior._value(x[first : end + 1], self._pairs(first, end))
 
@@ -322,6 +329,7 @@ class Penalty:
         out = np.zeros(x.shape, x.dtype)
 
         def work(slab: tuple[int, int, int]) -> None:
+            """Add a slab's part of the sum."""
             _, first, end = slab
             add(x[first : end + 1], self._pairs(first, end), out[first : end + 1])
 

@@ -72,24 +72,26 @@ def tv(
     radius = np.float32(weight / scale)
 
     def step(number: int, x: Array, progress: Progress | None) -> tuple[Array, float]:
-        # The state's keys are those of resumable files: images A x, extrapolated images and volume ("ahead", "beyond"), and
-        # the dual variables of images and gradient ("misfit", "slopes").
+        """Return the next volume after `x`, and its objective, in iteration `number`."""
+        # The state's keys are those of resumable files: images A x ("seen"), extrapolated images and volume ("ahead",
+        # "beyond"), and the dual variables of images and of the volume's gradient ("misfit", "slopes").
+        keys = ("seen", "ahead", "beyond", "misfit", "slopes")
         if not loop.state:
             images = loop.forward(x, fixed_progress(progress, 0, 2))
-            zeros = np.zeros_like(images), np.zeros((3, *x.shape), np.float32)
-            loop.state = {"seen": images, "ahead": images, "beyond": x, "misfit": zeros[0], "slopes": zeros[1]}
-        images, ahead, beyond, misfit, slopes = (loop.state[s] for s in ("seen", "ahead", "beyond", "misfit", "slopes"))
-        misfit = (misfit + pixel_steps * (ahead - loop.images)) / (1 + pixel_steps)
-        slopes = pairs * (slopes + gradient_step * _gradient(beyond, factors))
-        slopes /= np.maximum(1, np.sqrt(np.sum(slopes**2, axis=0)) / radius)
-        gradient = loop.adjoint(misfit, fixed_progress(progress, 0, 2)) + _gradient_adjoint(slopes, factors)
-        new = loop.bounded(x - voxel_steps * gradient)
-        new_images = loop.forward(new, fixed_progress(progress, 1, 2))
-        ahead, beyond = 2 * new_images - images, 2 * new - x
-        loop.state = {"seen": new_images, "ahead": ahead, "beyond": beyond, "misfit": misfit, "slopes": slopes}
+            duals = np.zeros_like(images), np.zeros((3, *x.shape), np.float32)
+            loop.state = dict(zip(keys, (images, images, x, *duals), strict=True))
+        images, extrapolated_images, extrapolated_x, image_dual, gradient_dual = (loop.state[key] for key in keys)
+        image_dual = (image_dual + pixel_steps * (extrapolated_images - loop.images)) / (1 + pixel_steps)
+        gradient_dual = pairs * (gradient_dual + gradient_step * _gradient(extrapolated_x, factors))
+        gradient_dual /= np.maximum(1, np.sqrt(np.sum(gradient_dual**2, axis=0)) / radius)
+        descent = loop.adjoint(image_dual, fixed_progress(progress, 0, 2)) + _gradient_adjoint(gradient_dual, factors)
+        new_x = loop.bounded(x - voxel_steps * descent)
+        new_images = loop.forward(new_x, fixed_progress(progress, 1, 2))
+        extrapolations = 2 * new_images - images, 2 * new_x - x
+        loop.state = dict(zip(keys, (new_images, *extrapolations, image_dual, gradient_dual), strict=True))
         tell(progress, 2, 2)
-        squares = float(np.sum(np.square(new_images - loop.images, dtype=float)))
-        return new, 0.5 * squares + weight * total_variation(new, A.grid, pairs)
+        squared_error = float(np.sum(np.square(new_images - loop.images, dtype=float)))
+        return new_x, 0.5 * squared_error + weight * total_variation(new_x, A.grid, pairs)
 
     return loop.run(step, weight=weight, nonnegative=nonnegative)
 

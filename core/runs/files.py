@@ -187,16 +187,17 @@ def _content_hash(arrays: dict[str, Array], attributes: dict[str, Any]) -> str:
 def _pack_hdf5(arrays: _Arrays, attributes: dict[str, Any]) -> memoryview:
     """Return an HDF5 file: datasets with a `unit`, with chunks of one view for reading views singly, and attributes."""
 
-    def fill(file: Any) -> None:
+    def write_contents(file: Any) -> None:
+        """Write the attributes and the arrays into an open ``h5py.File``."""
         file.attrs.update(attributes)
         for name, (unit, array) in arrays.items():
-            compression: dict[str, Any] = {}
+            storage_options: dict[str, Any] = {}
             if array.nbytes >= _COMPRESS_FROM:
-                compression = {"compression": "gzip", "compression_opts": 1, "shuffle": True}
-                compression["chunks"] = (1, *array.shape[1:])
-            file.create_dataset(name, data=array, **compression).attrs["unit"] = unit
+                storage_options = {"compression": "gzip", "compression_opts": 1, "shuffle": True}
+                storage_options["chunks"] = (1, *array.shape[1:])
+            file.create_dataset(name, data=array, **storage_options).attrs["unit"] = unit
 
-    return pack(_FORMAT, {}, fill)
+    return pack(_FORMAT, {}, write_contents)
 
 
 def _read_hdf5(path: Path) -> _Contents:

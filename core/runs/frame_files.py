@@ -257,9 +257,11 @@ def _read_interfile(path: Path, layout: CountsLayout) -> Counts:
     header = _interfile_header(path)
 
     def text(key: str, default: str = "") -> str:
+        """Return the first value of a key as a text."""
         return header.get(key, [default])[0]
 
     def number(key: str, default: float | None = None) -> float:
+        """Return the first value of a key as a finite number; raise `InputError` if it is none."""
         text_value = text(key, "" if default is None else str(default))
         try:
             value = float(text_value)

@@ -131,6 +131,7 @@ def write_recipe(recipe: Recipe, path: AnyPath) -> None:
     require_ending(path, (".toml",))
 
     def relative(name: str) -> str:
+        """Return a file's path relative to the recipe's folder."""
         try:
             return os.path.relpath(name, path.parent)
         except ValueError:  # on another drive

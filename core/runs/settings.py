@@ -249,7 +249,7 @@ _DECLARED = (
     Setting("frames.bins", float, None, "Energy bins of X rays, from, to, from, to …: a run of each, as OUTPUT-1, "
             "OUTPUT-2 …", "one, the window", unit="keV", least=0, sizes=(), option="--bins",
             needs=(_XRAYS, "no model.panel=energy", "no model.window", "no volume.states")),
-    Setting("noise.seed", int, None, "Draw Poisson counts with this seed; of several states or frames with SEED, SEED + 1 …",
+    Setting("noise.seed", int, None, "Draw counts with this seed; of several states or frames with SEED, SEED + 1 …",
             "their expected means", least=0, most=2**64 - 1,
             needs=(f"model.photons or {_PHOTONS}", "no model.panel=energy", _MADE), option="--noise"),
     *choice_setting("noise.model", NOISE_MODELS, "How counts vary around their means", option="--noise-model",

@@ -50,8 +50,7 @@ class Package:
     """Members of a workbook file, which is a zip archive; `name` is the file's name in messages."""
 
     def __init__(self, content: bytes, name: str) -> None:
-        self.name = name
-        self.content = content
+        self.name, self.content = name, content
         self._archive = zipfile.ZipFile(io.BytesIO(content))
         self._members = {info.filename.casefold(): info for info in self._archive.infolist()}
         self.names = [info.filename for info in self._members.values()]

@@ -94,12 +94,11 @@ def _ellipse(arguments: argparse.Namespace) -> None:
     mphdrr geometry generate ellipse --modules 20 --semi-axes 273 220.5 --center 42.43 -42.43 --start 14.25 --end 255.6
         --spacing arc --z -71 -24 --mirrored -o scanner.xlsx
     """
-    axes = arguments.semi_axes
+    semi_axes = arguments.semi_axes[0] if len(arguments.semi_axes) == 1 else arguments.semi_axes
     start, end, rotation = np.deg2rad([arguments.start, arguments.end, arguments.rotation])
-    ring = {"start": start, "end": end, "spacing": arguments.spacing}
-    curve = {"center": arguments.center, "rotation": rotation}
-    shape = arguments.modules, axes[0] if len(axes) == 1 else axes
-    _write(arguments, mph.ellipse_rings, *shape, **ring, **curve)
+    arc_options = {"start": start, "end": end, "spacing": arguments.spacing}
+    ellipse_options = {"center": arguments.center, "rotation": rotation}
+    _write(arguments, mph.ellipse_rings, arguments.modules, semi_axes, **arc_options, **ellipse_options)
 
 
 def _plates(arguments: argparse.Namespace) -> None:
@@ -115,9 +114,8 @@ def _plates(arguments: argparse.Namespace) -> None:
         raise mph.InputError(f"--vertices: expected x and y of each vertex, got {len(arguments.vertices)} numbers")
     else:
         vertices = np.reshape(arguments.vertices, (-1, 2))
-    counts = arguments.modules
-    shape = counts[0] if len(counts) == 1 else counts, vertices
-    _write(arguments, mph.plate_rings, *shape, closed=not arguments.open)
+    counts = arguments.modules[0] if len(arguments.modules) == 1 else arguments.modules
+    _write(arguments, mph.plate_rings, counts, vertices, closed=not arguments.open)
 
 
 def _xray_arc(arguments: argparse.Namespace) -> None:

@@ -53,8 +53,8 @@ class Legacy(ExportLayout):
 
     def contents(self, row: Row, event: Event) -> Iterator[tuple[str, bytes]]:
         """Yield the path and the tensor file of each array of an event."""
-        for file, (name, array) in zip(self.files(row), self.selection.arrays(event), strict=True):
-            yield file, pt_bytes((self.slots.arrange(array) if name == self.model else array)[None])
+        for path, (name, values) in zip(self.files(row), self.selection.arrays(event), strict=True):
+            yield path, pt_bytes((self.slots.arrange(values) if name == self.model else values)[None])
 
     def tables(self, rows: list[Row]) -> dict[str, bytes]:
         """Return the tables of positions, angles and slots, by file name."""

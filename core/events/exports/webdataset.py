@@ -35,7 +35,7 @@ class WebDataset(ExportLayout):
         self.events_per_shard = strict_whole(events_per_shard, "events_per_shard", "a whole number of at least 1")
 
     def parts(self, rows: list[Row]) -> list[ExportPart]:
-        """Return a part for each shard."""
+        """Return the parts of the export: the shards, .tar files, each with the events that it holds."""
         parts = []
         for split in dict.fromkeys(row["split"] for row in rows):
             members = [row["i"] for row in rows if row["split"] == split]
@@ -56,7 +56,7 @@ class WebDataset(ExportLayout):
                 report_event()
 
     def contents(self, row: Row, event: Event) -> Iterator[tuple[str, bytes]]:
-        """Yield the name and the content of each member of an event."""
+        """Yield the name and the content of each file of an event within the .tar."""
         key = f"{row['i']:06d}"
         for name, array in self.selection.arrays(event):
             if self.compressed:  # no time stamp, so that the same set gives the same bytes

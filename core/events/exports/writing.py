@@ -74,6 +74,7 @@ class ExportPlan:
         n_written = len(self.rows) - self.events
 
         def report_event() -> None:
+            """Report one further written event."""
             nonlocal n_written
             n_written += 1
             tell(progress, n_written, len(self.rows))

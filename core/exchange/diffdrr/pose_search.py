@@ -37,6 +37,7 @@ def local_ncc(a: Tensor, b: Tensor, patch: int = 9) -> Tensor:
         return ncc(a, b)
 
     def means(x: Tensor) -> Tensor:
+        """Return the means of `x` in the window around each pixel."""
         return avg_pool2d(x.reshape(-1, 1, *x.shape[-2:]), patch, stride=1).reshape(*x.shape[:-2], -1)
 
     a, b = _standardised(a), _standardised(b)

@@ -71,15 +71,18 @@ def load(module: str) -> ModuleType:
 
 
 def _array(x: ArrayOrTensor, float64: bool) -> ArrayOrTensor:
+    """Return `x` as a NumPy array of float32 or, with `float64`, of float64."""
     return to_numpy(x, np.float64 if float64 else np.float32)
 
 
 def _tensor(x: ArrayOrTensor, float64: bool) -> ArrayOrTensor:
+    """Return `x` as a tensor on its device; of float64 with `float64`, else in its own type."""
     tensor = to_tensor(x)
     return tensor.double() if float64 else tensor
 
 
 def _on_gpu(x: ArrayOrTensor, float64: bool) -> ArrayOrTensor:
+    """Return `x` as a tensor of float32 on the GPU."""
     return load("cuda").to_backend(x)
 
 

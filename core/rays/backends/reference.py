@@ -166,6 +166,7 @@ def _lattices(volume: Array, rays: Rays, attenuation: Attenuation | None) -> lis
     """Return the rays in the volume's lattice, and in that of mu if mu has its own."""
 
     def lattice(array: Array, rays: Rays) -> _LatticeRays:
+        """Return the rays in the lattice of `array`."""
         listed = rays.listed()
         numbers = (listed.starts, listed.directions, listed.lengths)
         return _LatticeRays(tuple(array.shape), *(_as_volume(x, volume) for x in numbers))
@@ -210,6 +211,7 @@ def _voxels(lattice: _LatticeRays, alpha: Array) -> tuple[Array, Array]:
     xp = namespace(alpha)
 
     def voxels() -> Iterator[Array]:
+        """Yield the points' voxel indices (n, S) axis by axis."""
         for a in range(3):
             coordinate = alpha * lattice.directions[:, a, None]
             coordinate += lattice.starts[:, a, None]
@@ -228,6 +230,7 @@ def _voxels_beyond(lattice: _LatticeRays, axis: Array) -> tuple[Array, Array]:
     xp = namespace(axis)
 
     def voxels() -> Iterator[Array]:
+        """Yield the segments' voxel indices (n, S) axis by axis."""
         for a, n in enumerate(lattice.shape):
             crossed = xp.cumsum(axis[:, :-1] == a, 1)
             start, direction = lattice.starts[:, a, None], lattice.directions[:, a, None]

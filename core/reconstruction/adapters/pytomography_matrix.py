@@ -55,4 +55,5 @@ class ProjectorMatrix(SystemMatrix):
         return self.backward(torch.ones(self._subset(subset_idx).shape_out, device=pytomography.device), subset_idx)
 
     def _subset(self, subset_idx: int | None) -> Projector:
+        """Return the projector of a subset, or of all views for None."""
         return self.projector if subset_idx is None else self._subsets[subset_idx]

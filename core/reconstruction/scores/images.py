@@ -98,6 +98,7 @@ def ssim(volume: Values, truth: Values, data_range: float | None = None, progres
     sums = np.zeros(inner)
 
     def work(first: int) -> None:
+        """Store the mean similarity index of each plane in the slab that starts at plane `first`."""
         slab = slice(first, min(first + step, inner) + 2 * _RADIUS)
         x, y = values[slab], true[slab]
         mean_x, mean_y, xx, yy, xy = (_windowed(moment) for moment in (x, y, x * x, y * y, x * y))

@@ -36,10 +36,10 @@ def _attribute_text(attribute: Any) -> str | None:
 
 def write(volume: Volume, temporary: Path) -> None:
     """Write a volume as .h5 or .hdf5 to the path `temporary`."""
-    temporary.write_bytes(pack("mphDRR volume", {}, partial(fill, volume)))
+    temporary.write_bytes(pack("mphDRR volume", {}, partial(write_datasets, volume)))
 
 
-def fill(volume: Volume, file: Any) -> None:
+def write_datasets(volume: Volume, file: Any) -> None:
     """Write the volume's datasets into the root of an open ``h5py.File``."""
     array = file.create_dataset("array", data=volume.array, compression="gzip", compression_opts=1, shuffle=True)
     array.attrs.update(quantity=volume.quantity, unit=volume.unit, **({"note": volume.note} if volume.note else {}))

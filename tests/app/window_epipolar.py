@@ -75,14 +75,7 @@ def steps():
     b = np.linalg.norm(system.centers[NUMBER - 1])
     point = core.points_at_depths(views, NUMBER - 1, PIXEL, SHARE * b)
     seen["point"] = point.tolist()
-    press(
-        bpy.ops.mphdrr.add_points,
-        "EXEC_DEFAULT",
-        counts=(1, 1, 1),
-        diameter=6.0,
-        voxels=24,
-        location=point.tolist(),
-    )
+    press(bpy.ops.mphdrr.add_points, "EXEC_DEFAULT", counts=(1, 1, 1), diameter=6.0, voxels=24, location=point.tolist())
     yield from idle()
     settings = scene.mphdrr_projections
     settings.volume = bpy.context.object

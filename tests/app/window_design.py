@@ -1,22 +1,9 @@
 """Design in the window: keys and undo as a user's; leaves the window while a module is being moved."""
 
 import bpy
-from driving import (
-    WORKBOOK,
-    drawn,
-    editor,
-    empty_scene,
-    keys,
-    module,
-    open_tab,
-    opened,
-    press,
-    run,
-    scanner,
-    seen,
-    within,
-)
+from driving import WORKBOOK, drawn, editor, empty_scene, module, open_tab, opened, press, run, scanner, seen, within
 from mathutils import Euler
+from pointing import keys
 
 
 def state(number: int) -> dict[str, object]:

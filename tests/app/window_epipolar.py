@@ -3,22 +3,9 @@
 import bpy
 import numpy as np
 from bpy_extras.view3d_utils import location_3d_to_region_2d, region_2d_to_origin_3d, region_2d_to_vector_3d
-from driving import (
-    WORKBOOK,
-    drawn,
-    editor,
-    idle,
-    on_screen,
-    open_tab,
-    opened,
-    ours,
-    own_time,
-    picture,
-    press,
-    run,
-    seen,
-    xdotool,
-)
+from driving import WORKBOOK, drawn, editor, idle, open_tab, opened, ours, press, run, seen
+from pauses import own_time
+from pointing import on_screen, picture, xdotool
 
 core, epipolar, epipolar_drawing = map(
     ours, ("core", "addon.perspective.epipolar", "addon.perspective.epipolar_drawing")

@@ -1,21 +1,8 @@
 """Events of a recipe in the window: tried on the phantom, made as a set (cancelled, then gone on with), one opened."""
 
 import bpy
-from driving import (
-    WORKBOOK,
-    beat,
-    beats,
-    editor,
-    folder,
-    only,
-    open_tab,
-    ours,
-    pause_beyond_redraw,
-    press,
-    run,
-    seen,
-    within,
-)
+from driving import WORKBOOK, editor, folder, only, open_tab, ours, press, run, seen, within
+from pauses import beat, beats, pause_beyond_redraw
 
 jobs, runs, event_notes = map(ours, ("addon.blender.jobs", "addon.runs.runs", "addon.events.event_notes"))
 seen |= {"numbers": [], "poses": [], "words": [], "pauses": []}

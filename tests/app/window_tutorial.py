@@ -9,23 +9,8 @@ from collections.abc import Callable
 
 import bpy
 import numpy as np
-from driving import (
-    drawn,
-    editor,
-    folder,
-    is_idle,
-    keys,
-    module,
-    open_tab,
-    opened,
-    picture,
-    press,
-    run,
-    scanner,
-    seen,
-    sidebar,
-    xdotool,
-)
+from driving import drawn, editor, folder, is_idle, module, open_tab, opened, press, run, scanner, seen, sidebar
+from pointing import keys, picture, xdotool
 
 STEPS: list[Callable] = []
 

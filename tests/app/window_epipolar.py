@@ -75,18 +75,13 @@ def steps():
     yield from drawn()
     open_tab("IMAGE_EDITOR")
     yield from drawn()
-    press(
-        bpy.ops.image.view_zoom_ratio, "EXEC_DEFAULT", kind="IMAGE_EDITOR", ratio=2.0
-    )  # a pixel is some of the screen's then
+    # A pixel is several of the screen's then.
+    press(bpy.ops.image.view_zoom_ratio, "EXEC_DEFAULT", kind="IMAGE_EDITOR", ratio=2.0)
     yield from drawn()
     start = np.array(place_of(NUMBER, PIXEL))
     middle = np.array(on_screen(region.width / 2, region.height / 2, "IMAGE_EDITOR"))
-    press(
-        bpy.ops.image.view_pan,
-        "EXEC_DEFAULT",
-        kind="IMAGE_EDITOR",
-        offset=(np.array([1, -1]) * (start - middle) / 2).tolist(),
-    )
+    offset = (np.array([1, -1]) * (start - middle) / 2).tolist()
+    press(bpy.ops.image.view_pan, "EXEC_DEFAULT", kind="IMAGE_EDITOR", offset=offset)
     yield from drawn()
     press(bpy.ops.mphdrr.pick_pixel, kind="IMAGE_EDITOR")
     yield 0.5

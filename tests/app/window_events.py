@@ -9,15 +9,11 @@ seen |= {"numbers": [], "poses": [], "words": [], "pauses": []}
 RECIPE = f"""
 version = 1
 seed = 4
-[system]
-file = '{WORKBOOK}'
-modules = "1-8"
-[detector]
-rows = 64
-columns = 64
-[truth]
-voxels = 64
-spacing = 1.5
+system = {{ file = '{WORKBOOK}', modules = "1-8" }}
+detector = {{ rows = 64, columns = 64 }}
+truth = {{ voxels = 64, spacing = 1.5 }}
+models = {{ lines = {{ kind = "transmission" }} }}
+radon = {{ angles = 32 }}
 [[phantoms]]
 kind = "derenzo"
 radius = {{ from = 28, to = 36 }}
@@ -32,10 +28,6 @@ disk_radius = {{ from = 20, to = 30 }}
 disks = {{ from = 2, to = 4 }}
 [phantoms.pose]
 turn = "uniform"
-[models.lines]
-kind = "transmission"
-[radon]
-angles = 32
 """
 
 

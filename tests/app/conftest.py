@@ -7,6 +7,7 @@ from it go to `work_folder`.
 
 from __future__ import annotations
 
+import functools
 import json
 import os
 import shutil
@@ -103,22 +104,13 @@ def work_folder(home: Path, request: pytest.FixtureRequest) -> Path:
 @pytest.fixture
 def blender(home: Path) -> Run:
     """Return `blender(*arguments, check=True, network=False, timeout=300)`: it runs with the extension, for its output."""
-
-    def run(*arguments: str | Path, **options: float) -> subprocess.CompletedProcess[str]:
-        return run_blender(*arguments, home=home, **options)
-
-    return run
+    return functools.partial(run_blender, home=home)
 
 
 @pytest.fixture
 def new_blender(request: pytest.FixtureRequest) -> Run:
     """Return a `blender` in a clean home of the test's own, without the extension."""
-    folder = _emptied(OUTPUT / f"home-{request.node.name}")
-
-    def run(*arguments: str | Path, **options: float) -> subprocess.CompletedProcess[str]:
-        return run_blender(*arguments, home=folder, **options)
-
-    return run
+    return functools.partial(run_blender, home=_emptied(OUTPUT / f"home-{request.node.name}"))
 
 
 @pytest.fixture

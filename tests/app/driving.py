@@ -1,11 +1,10 @@
-"""What the scripts in the window share: its editors, keys and mouse, pictures, and the steps that they take.
+"""What the scripts in the window share: its editors and panels, and the steps that they take.
 
 A script's arguments stand after ``--``: the folder for its files, then its own, `ARGUMENTS`. `seen` is what its test gets.
 """
 
 import itertools
 import json
-import subprocess
 import sys
 import time
 import traceback
@@ -15,8 +14,6 @@ from pathlib import Path
 from types import ModuleType
 
 import bpy
-from bpy_extras.view3d_utils import location_3d_to_region_2d
-from mathutils import Euler
 
 folder, *ARGUMENTS = map(Path, sys.argv[sys.argv.index("--") + 1 :])
 WORKBOOK = Path(bpy.utils.user_resource("EXTENSIONS")) / "user_default/mphdrr/examples/dc-spect-80.xlsx"
@@ -84,64 +81,6 @@ def opened(*names: str, but_closed: tuple[str, ...] = ()) -> None:
         bpy.utils.register_class(cls)
 
 
-def xdotool(*what: object) -> None:
-    """Move the mouse or type, by xdotool's command line."""
-    subprocess.run(["xdotool", *map(str, what)], check=True)
-
-
-def proposed() -> str:
-    """Return the text of the button at the top of the tab."""
-    return ours("addon.next_step").next_step(bpy.context).text
-
-
-def click_proposed(first: int = 44) -> None:
-    """Click on the button at the tab's top; `first`: pixels from the sidebar's top to that button in an empty scene."""
-    region, window = sidebar(), editor()[0]
-    down = first if proposed() == "Load Example" else 160
-    xdotool("mousemove", round(region.x + 0.4 * region.width), window.height - region.y - region.height + down)
-    xdotool("click", 1)
-
-
-def on_screen(x: float, y: float, kind: str = "VIEW_3D") -> tuple[int, int]:
-    """Return the position on the screen of a place of an editor's region."""
-    window, _, region = editor(kind)
-    return round(region.x + x), round(window.height - 1 - region.y - y)
-
-
-def frame(kind: str = "VIEW_3D") -> list[int]:
-    """Return left, top, right and bottom of an editor's region on the screen."""
-    region = editor(kind)[2]
-    return [*on_screen(0, region.height, kind), *on_screen(region.width, 0, kind)]
-
-
-def place(point) -> tuple[int, int]:
-    """Return the position on the screen of a place in the world, in the 3D view."""
-    region = editor()[2]
-    return on_screen(*location_3d_to_region_2d(region, region.data, point))
-
-
-def look(distance: float, angles=(0.0, 0.0, 0.0), at=(0.0, 0.0, 0.0)) -> None:
-    """Look at a place from these angles, without perspective."""
-    view = editor()[2].data
-    view.view_perspective, view.view_rotation = "ORTHO", Euler(angles).to_quaternion()
-    view.view_location, view.view_distance = at, distance
-
-
-def keys(*names: str) -> None:
-    """Type keys with the mouse in the middle of the 3D view."""
-    _, _, region = editor()
-    xdotool("mousemove", *on_screen(region.width // 2, region.height // 2))
-    for name in names:
-        xdotool("key", "--delay", "60", name)
-
-
-def picture(name: str) -> Path:
-    """Capture the screen in the folder."""
-    path = folder / f"{name}.png"
-    subprocess.run(["import", "-window", "root", str(path)], check=True)
-    return path
-
-
 def empty_scene() -> None:
     """Remove the objects of the start-up file."""
     for name in ("Cube", "Light", "Camera"):
@@ -172,14 +111,6 @@ def idle() -> Iterator[float]:
         yield 0.3
 
 
-def escape_asks() -> Iterator[float]:
-    """Press Escape, which asks whether to keep the job's result while the job goes on; close the question unanswered."""
-    keys("Escape")
-    yield 1.0
-    seen["asked"] = ours("addon.blender.jobs").is_running()
-    keys("Escape")
-
-
 def drawn(times: int = 2) -> Iterator[float]:
     """Wait until all has been drawn anew, which takes seconds in software: timers run between two drawings."""
     for _ in range(times):
@@ -187,40 +118,6 @@ def drawn(times: int = 2) -> Iterator[float]:
             for area in window.screen.areas:
                 area.tag_redraw()
         yield 0.1
-
-
-beats: list[float] = []
-
-
-def own_time() -> float:
-    """Return the time, s, without that in which this thread could run but had no processor (Linux counts it)."""
-    try:
-        waited = int(Path("/proc/thread-self/schedstat").read_text().split()[1])
-    except OSError:
-        waited = 0
-    return time.perf_counter() - waited * 1e-9
-
-
-def beat() -> float:
-    """Note the time, as a timer whose pauses are measured, and the words of the running job."""
-    beats.append(own_time())
-    current = ours("addon.blender.jobs")._current
-    if current is not None and current.text not in seen["words"]:
-        seen["words"].append(current.text)
-    return 0.02
-
-
-def longest_pause() -> float:
-    """Return the longest pause between two beats, s."""
-    return max(b - a for a, b in itertools.pairwise(beats))
-
-
-def pause_beyond_redraw() -> Iterator[float]:
-    """Yield seconds to wait; return the longest pause since the beats were cleared, less that of a redraw."""
-    during = longest_pause()
-    beats.clear()
-    yield from drawn(3)
-    return round(during - longest_pause(), 3)
 
 
 def run(steps: Iterator[float | Callable[[], bool]], patience: float = 120.0, settle: float = 0.0) -> None:

@@ -40,7 +40,10 @@ def main(picture: str, script: str, seconds: str, folder: str, *arguments: str) 
     with os.fdopen(reading) as number:
         os.environ["DISPLAY"] = f":{number.readline().strip()}"
     place = ["--window-geometry", "0", "0", str(width), str(height)]
-    place += ["--python-expr", f"import sys; sys.path.insert(0, {str(Path(__file__).parent)!r})"]  # for driving.py
+    place += [
+        "--python-expr",
+        f"import sys; sys.path.insert(0, {str(Path(__file__).parent)!r})",
+    ]  # for what scripts import
     with open(Path(folder, "log.txt"), "w") as log:
         blender = subprocess.Popen(["blender", *place, "--python", script, "--", *arguments], stdout=log, stderr=log)
     end = time.monotonic() + float(seconds)

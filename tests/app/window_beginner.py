@@ -6,7 +6,8 @@ With the example, and in a new scene with a workbook.
 from collections.abc import Iterator
 
 import bpy
-from driving import WORKBOOK, click_proposed, drawn, editor, idle, open_tab, picture, proposed, run, seen
+from driving import WORKBOOK, drawn, editor, idle, open_tab, run, seen
+from pointing import click_proposed, picture, proposed
 
 _MOST = 6
 

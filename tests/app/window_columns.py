@@ -3,7 +3,8 @@
 import json
 
 import bpy
-from driving import ARGUMENTS, drawn, editor, folder, module, on_screen, picture, press, run, seen, xdotool
+from driving import ARGUMENTS, drawn, editor, folder, module, press, run, seen
+from pointing import on_screen, picture, xdotool
 
 (workbook,) = ARGUMENTS
 

@@ -4,7 +4,8 @@ import time
 
 import bpy
 import numpy as np
-from driving import drawn, editor, is_idle, open_tab, press, run, seen, xdotool
+from driving import drawn, editor, is_idle, open_tab, press, run, seen
+from pointing import xdotool
 
 
 def place_of(number: int) -> tuple[int, int, int, int]:

@@ -3,22 +3,9 @@
 import bpy
 import numpy as np
 from bpy_extras.view3d_utils import location_3d_to_region_2d, region_2d_to_origin_3d, region_2d_to_vector_3d
-from driving import (
-    WORKBOOK,
-    drawn,
-    editor,
-    idle,
-    on_screen,
-    open_tab,
-    opened,
-    ours,
-    own_time,
-    picture,
-    press,
-    run,
-    seen,
-    xdotool,
-)
+from driving import WORKBOOK, drawn, editor, idle, open_tab, opened, ours, press, run, seen
+from pauses import own_time
+from pointing import on_screen, picture, xdotool
 
 core, epipolar, epipolar_drawing = map(
     ours, ("core", "addon.perspective.epipolar", "addon.perspective.epipolar_drawing")
@@ -75,14 +62,7 @@ def steps():
     b = np.linalg.norm(system.centers[NUMBER - 1])
     point = core.points_at_depths(views, NUMBER - 1, PIXEL, SHARE * b)
     seen["point"] = point.tolist()
-    press(
-        bpy.ops.mphdrr.add_points,
-        "EXEC_DEFAULT",
-        counts=(1, 1, 1),
-        diameter=6.0,
-        voxels=24,
-        location=point.tolist(),
-    )
+    press(bpy.ops.mphdrr.add_points, "EXEC_DEFAULT", counts=(1, 1, 1), diameter=6.0, voxels=24, location=point.tolist())
     yield from idle()
     settings = scene.mphdrr_projections
     settings.volume = bpy.context.object
@@ -95,18 +75,13 @@ def steps():
     yield from drawn()
     open_tab("IMAGE_EDITOR")
     yield from drawn()
-    press(
-        bpy.ops.image.view_zoom_ratio, "EXEC_DEFAULT", kind="IMAGE_EDITOR", ratio=2.0
-    )  # a pixel is some of the screen's then
+    # A pixel is several of the screen's then.
+    press(bpy.ops.image.view_zoom_ratio, "EXEC_DEFAULT", kind="IMAGE_EDITOR", ratio=2.0)
     yield from drawn()
     start = np.array(place_of(NUMBER, PIXEL))
     middle = np.array(on_screen(region.width / 2, region.height / 2, "IMAGE_EDITOR"))
-    press(
-        bpy.ops.image.view_pan,
-        "EXEC_DEFAULT",
-        kind="IMAGE_EDITOR",
-        offset=(np.array([1, -1]) * (start - middle) / 2).tolist(),
-    )
+    offset = (np.array([1, -1]) * (start - middle) / 2).tolist()
+    press(bpy.ops.image.view_pan, "EXEC_DEFAULT", kind="IMAGE_EDITOR", offset=offset)
     yield from drawn()
     press(bpy.ops.mphdrr.pick_pixel, kind="IMAGE_EDITOR")
     yield 0.5

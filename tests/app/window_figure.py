@@ -5,7 +5,8 @@ import sys
 import time
 
 import bpy
-from driving import WORKBOOK, drawn, editor, escape_asks, folder, idle, is_idle, picture, press, run, seen
+from driving import WORKBOOK, drawn, editor, folder, idle, is_idle, press, run, seen
+from pointing import escape_asks, picture
 
 
 def steps():

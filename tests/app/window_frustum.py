@@ -1,7 +1,8 @@
 """A phantom as one module sees it, from aside and from its pinhole, and a back-projection; a picture of each."""
 
 import bpy
-from driving import WORKBOOK, drawn, editor, idle, look, only, open_tab, picture, place, press, run, seen
+from driving import WORKBOOK, drawn, editor, idle, only, open_tab, press, run, seen
+from pointing import look, picture, place
 
 MODULE = 27
 

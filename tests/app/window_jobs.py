@@ -6,21 +6,8 @@ from pathlib import Path
 import addon_utils
 import bpy
 import numpy as np
-from driving import (
-    WORKBOOK,
-    beat,
-    beats,
-    drawn,
-    editor,
-    folder,
-    open_tab,
-    ours,
-    pause_beyond_redraw,
-    press,
-    run,
-    seen,
-    within,
-)
+from driving import WORKBOOK, drawn, editor, folder, open_tab, ours, press, run, seen, within
+from pauses import beat, beats, pause_beyond_redraw
 
 jobs = ours("addon.blender.jobs")
 seen |= {"gaps": {}, "words": [], "changed": []}

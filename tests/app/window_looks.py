@@ -1,7 +1,8 @@
 """A look is dragged from the Asset Browser onto a phantom with slices; leaves the window as it is then."""
 
 import bpy
-from driving import drawn, editor, empty_scene, idle, look, on_screen, picture, press, run, seen, within, xdotool
+from driving import drawn, editor, empty_scene, idle, press, run, seen, within
+from pointing import look, on_screen, picture, xdotool
 
 
 def brightest(item) -> list[float]:

@@ -3,8 +3,9 @@
 import math
 
 import bpy
-from driving import WORKBOOK, drawn, editor, empty_scene, folder, open_tab, place, press, run, seen
+from driving import WORKBOOK, drawn, editor, empty_scene, folder, open_tab, press, run, seen
 from mathutils import Euler
+from pointing import place
 
 
 def steps():

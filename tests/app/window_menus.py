@@ -1,7 +1,8 @@
 """Commands found by the menus' search (F3) and started from it; leaves the search for "projection" open."""
 
 import bpy
-from driving import WORKBOOK, drawn, editor, on_screen, press, run, seen, xdotool
+from driving import WORKBOOK, drawn, editor, press, run, seen
+from pointing import on_screen, xdotool
 
 
 def search() -> None:

@@ -1,7 +1,8 @@
 """How tall the tab is with everything open, after the example was reconstructed, in pixels."""
 
 import bpy
-from driving import drawn, editor, idle, open_tab, opened, panels, picture, press, run, seen, sidebar
+from driving import drawn, editor, idle, open_tab, opened, panels, press, run, seen, sidebar
+from pointing import picture
 
 
 def steps():

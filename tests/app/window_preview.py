@@ -2,7 +2,9 @@
 
 import bpy
 import numpy as np
-from driving import drawn, editor, folder, idle, on_screen, open_tab, ours, own_time, picture, press, run, seen, xdotool
+from driving import drawn, editor, folder, idle, open_tab, ours, press, run, seen
+from pauses import own_time
+from pointing import on_screen, picture, xdotool
 
 core, preview, volumes = (ours(name) for name in ("core", "addon.runs.preview", "addon.volumes.volumes"))
 images = ours("addon.pictures.images")

@@ -1,7 +1,8 @@
 """Counts of a few modules are reconstructed in the window: what is seen while it runs, then finished early."""
 
 import bpy
-from driving import WORKBOOK, editor, escape_asks, idle, only, open_tab, ours, press, run, seen
+from driving import WORKBOOK, editor, idle, only, open_tab, ours, press, run, seen
+from pointing import escape_asks
 
 seen |= {"iterations": []}
 

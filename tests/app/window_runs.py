@@ -1,7 +1,8 @@
 """Two runs of the example in the window: a module is moved and moved back, the run is rendered again, both are compared."""
 
 import bpy
-from driving import drawn, editor, idle, open_tab, ours, own_time, press, run, seen
+from driving import drawn, editor, idle, open_tab, ours, press, run, seen
+from pauses import own_time
 
 runs = ours("addon.runs.runs")
 

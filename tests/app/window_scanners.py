@@ -3,22 +3,9 @@
 import bpy
 import numpy as np
 from bpy_extras.view3d_utils import location_3d_to_region_2d
-from driving import (
-    WORKBOOK,
-    drawn,
-    editor,
-    empty_scene,
-    keys,
-    module,
-    on_screen,
-    open_tab,
-    press,
-    run,
-    seen,
-    within,
-    xdotool,
-)
+from driving import WORKBOOK, drawn, editor, empty_scene, module, open_tab, press, run, seen, within
 from mathutils import Matrix, Vector
+from pointing import keys, on_screen, xdotool
 
 
 def mouse(x: float, y: float, *then: str) -> None:

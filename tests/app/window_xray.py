@@ -1,7 +1,8 @@
 """From a clean home to CT, SPECT with it, and dose, by clicks on the buttons that the tab proposes."""
 
 import bpy
-from driving import click_proposed, drawn, editor, idle, open_tab, ours, picture, proposed, run, seen
+from driving import drawn, editor, idle, open_tab, ours, run, seen
+from pointing import click_proposed, picture, proposed
 
 _FIRST = 78  # pixels from the sidebar's top to the button of the X-ray example
 

@@ -12,7 +12,7 @@ import pytest
 from mphdrr.addon.blender import storage
 from mphdrr.addon.phantoms import phantoms
 from mphdrr.addon.phantoms.phantom_properties import plain_settings
-from mphdrr.addon.volumes import slices, stored_volumes, volume_materials, volumes
+from mphdrr.addon.volumes import slices, stored_volumes, volumes
 from mphdrr.addon.volumes.stored_volumes import store_volume
 from mphdrr.addon.volumes.vdb import openvdb, write_vdb
 from mphdrr.core.errors import InputError
@@ -156,10 +156,6 @@ def test_slices_of_a_large_volume_are_quick():
         item.mphdrr_volume.slices[2] = 100 + k
         took.append(time.thread_time() - start)
     assert min(took) < 0.1, took  # all three planes
-
-
-def test_ramps_are_of_the_quantity(ct):
-    assert volume_materials.ramp("hu") == volume_materials.ramp("mu") != volume_materials.ramp("activity")
 
 
 def test_unused_files_are_cleaned_up_and_no_others(tmp_path, ct):

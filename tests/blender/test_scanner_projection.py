@@ -25,20 +25,14 @@ def project(views: Views, points: np.ndarray) -> np.ndarray:
     return image[..., :2] / image[..., 2:]
 
 
-def blender_pixels(scene, camera, points: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
-    """Return columns and rows (N, 2) by Blender; its x grows to the right, which is -u."""
-    n_v, n_u = shape
-    seen = np.array([world_to_camera_view(scene, camera, Vector(p))[:] for p in points])
-    return np.stack([(1 - seen[:, 0]) * n_u - 0.5, seen[:, 1] * n_v - 0.5], axis=1)
-
-
 def assert_blender_agrees(scene, collection, views: Views) -> None:
     update()
     inside_roi = scanner.modules(collection)[0].mphdrr_module.roi_radius / np.sqrt(3)
     points = np.random.default_rng(1).uniform(-inside_roi, inside_roi, (40, 3))
     for camera, expected in zip(scanner.modules(collection), project(views, points), strict=True):
-        got = blender_pixels(scene, camera, points, views.shape)
-        assert np.abs(got - expected).max() < 1e-3
+        x, y = np.transpose([world_to_camera_view(scene, camera, Vector(point))[:2] for point in points])
+        pixels = np.stack([(1 - x) * views.shape[1] - 0.5, y * views.shape[0] - 0.5], axis=1)  # x is along -u
+        assert np.abs(pixels - expected).max() < 1e-3
 
 
 @pytest.mark.parametrize("shape", [(256, 256), (128, 200)])

@@ -76,7 +76,8 @@ class Seal(NamedTuple):
 def pack(kind: str, fields: dict[str, str], fill: Callable[[Any], None]) -> memoryview:
     """Return the bytes of a sealed file; `fill` writes its content into an open ``h5py.File``.
 
-    The file is made in memory, because HDF5 crashes if a write fails, for example on a full disk.
+    `kind` names the kind of file and `fields` are further texts of the seal, which is read without HDF5. The file is made in
+    memory, because HDF5 crashes if a write fails, for example on a full disk.
     """
     import h5py
 

@@ -105,10 +105,10 @@ class MPHDRR_OT_import_geometry(bpy.types.Operator):
 
     def _build(self, context: bpy.types.Context, system: Scanner) -> str:
         """Build the workbook's scanners in the scene, `system` last; return the operator's message."""
-        camera = context.scene.camera
+        scene_camera = context.scene.camera
         for further in self._further_scanners:
             scanner.build_scanner(context.scene, further, self._scanner_name(further), replace=self.replace)
-        context.scene.camera = camera  # if it is none, the first camera of `system` becomes the scene's
+        context.scene.camera = scene_camera  # if it is none, the first camera of `system` becomes the scene's
         construction = Construction(self.plate_thickness, self.wall_thickness)
         shape = self.image_size[1], self.image_size[0]
         collection = scanner.build_scanner(
@@ -118,7 +118,7 @@ class MPHDRR_OT_import_geometry(bpy.types.Operator):
         context.view_layer.update()  # so that scripts find the children's matrix_world in place
         self._dialog = ""
         column_maps.clear(context.window_manager.mphdrr_columns)
-        additions = "".join(f" and {len(scanner)} of the kind {scanner.kind}" for scanner in self._further_scanners)
+        additions = "".join(f" and {len(further)} of the kind {further.kind}" for further in self._further_scanners)
         return f"Imported {len(system)} modules{additions} into '{collection.name}'"
 
     def cancel(self, context: bpy.types.Context) -> None:

@@ -126,16 +126,16 @@ class Worker(threading.Thread):
     @property
     def text(self) -> str:
         """The stage in words, with its progress and the time that it has taken or still takes."""
-        words, seconds = self.stage[:1].upper() + self.stage[1:], time.monotonic() - self.stage_start
+        stage_text, elapsed = self.stage[:1].upper() + self.stage[1:], time.monotonic() - self.stage_start
         if self.cancel.is_set():
-            return f"{words}: stopping"
+            return f"{stage_text}: stopping"
         if self.total < 2:
-            return f"{words}, {seconds:.0f} s" if seconds > _ESTIMATE_AFTER else words
-        words = f"{words} {self.done} of {self.total}"
-        if seconds < _ESTIMATE_AFTER or not self.done:
-            return words
-        remaining = seconds / self.done * (self.total - self.done)
-        return f"{words}, {f'{remaining:.0f} s' if remaining < 100 else f'{remaining / 60:.0f} min'} left"
+            return f"{stage_text}, {elapsed:.0f} s" if elapsed > _ESTIMATE_AFTER else stage_text
+        stage_text = f"{stage_text} {self.done} of {self.total}"
+        if elapsed < _ESTIMATE_AFTER or not self.done:
+            return stage_text
+        remaining = elapsed / self.done * (self.total - self.done)
+        return f"{stage_text}, {f'{remaining:.0f} s' if remaining < 100 else f'{remaining / 60:.0f} min'} left"
 
     @property
     def is_stoppable(self) -> bool:

@@ -139,7 +139,7 @@ def _render_figure(kind: FigureKind, page: Page, subject: FigureSubject, paths: 
 
 
 def _run_steps(steps: Any) -> None:
-    """Take the steps of a drawing, and show its progress."""
+    """Run the generator of a drawing to its end, and show the progress that it yields."""
     report = progress_bar("rendering")
     for step in filter(None, steps):
         report(*step[1:])

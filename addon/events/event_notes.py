@@ -117,7 +117,10 @@ def _stamp(path: Path) -> _Stamp:
 
 @functools.lru_cache(maxsize=64)
 def _cached_stamp(path: Path, interval: float) -> _Stamp:
-    """Return a stamp; `interval`, the number of the present two seconds, lets the cache forget older stamps."""
+    """Return the stamp of a file or folder, see `_stamp`.
+
+    The number of the present two seconds, `interval`, makes the cache forget older stamps.
+    """
     stamp = []
     for member_path in (path, path / RECIPE, path / INDEX, path / EVENTS, path / SHARDS):
         with contextlib.suppress(OSError):

@@ -88,17 +88,17 @@ def run_views(scene: bpy.types.Scene) -> RunViews | None:
     mosaic_tiles = images.tiles(mosaic)
     if mosaic is None or mosaic_tiles is None or not images.belong_to(scene):
         return None
-    uid = mosaic.session_uid
-    if uid not in _runs:
+    mosaic_uid = mosaic.session_uid
+    if mosaic_uid not in _runs:
         _runs.clear()
-        stored = images.mosaic_views(mosaic)
-        if stored is None:
+        stored_views = images.mosaic_views(mosaic)
+        if stored_views is None:
             return None
-        views, roi_radius = stored
+        views, roi_radius = stored_views
         arrays = (views.sources, views.detector_centers, views.u_steps, views.v_steps)
         content = repr((mosaic_tiles["numbers"], views.shape)).encode() + b"".join(array.tobytes() for array in arrays)
-        _runs[uid] = RunViews(views, mosaic_tiles["numbers"], roi_radius, hashlib.sha256(content).hexdigest())
-    return _runs[uid]
+        _runs[mosaic_uid] = RunViews(views, mosaic_tiles["numbers"], roi_radius, hashlib.sha256(content).hexdigest())
+    return _runs[mosaic_uid]
 
 
 def required_views(scene: bpy.types.Scene) -> RunViews:

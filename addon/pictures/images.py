@@ -263,7 +263,7 @@ def _store_image(name: str, file: bytes) -> bpy.types.Image:
 
 
 def difference_text() -> str:
-    """Return the numbers of the difference that was drawn last; "" where there is none."""
+    """Return the text with the numbers of the difference between runs that was drawn last; "" where there is none."""
     image = bpy.data.images.get(ids.DIFFERENCE)
     return str(image.get(_TEXT, "")) if image is not None else ""
 

@@ -157,7 +157,7 @@ def _visibility(scene: bpy.types.Scene) -> list[tuple[bpy.types.Object, bool]]:
 
 
 def _set_background(camera: bpy.types.Camera, field: NDArray[np.float64], picture: bpy.types.Image) -> None:
-    """Lay a picture over a camera's view."""
+    """Lay a picture over a camera's view, flipped as the module's image `field` demands."""
     background = camera.background_images.new()
     background.image = picture
     background.frame_method, background.display_depth = "STRETCH", "FRONT"

@@ -62,7 +62,7 @@ class Request:
 
 @dataclass(frozen=True, eq=False)
 class Preview:
-    """A finished preview."""
+    """Preview of a run: the picture of one module, which is not stored as a run."""
 
     run: ProjectionRun  # run of one module, with the exact numbers
     picture: NDArray[np.uint8]  # colours (height, width, 3), row 0 at the top
@@ -176,7 +176,7 @@ def _cache_key(request: Request) -> tuple[str, ...]:
 
 
 class Session:
-    """State of the preview from when it is switched on until it is switched off."""
+    """Present request, worker thread and picture of the preview, from when it is switched on until it is switched off."""
 
     def __init__(self) -> None:
         self.voxels: dict[Path, Volume] = {}  # volumes in memory, by file

@@ -422,6 +422,7 @@ def _change_text(old: Any, new: Any, unit: str, setting: Setting | None = None) 
     """Return two values in words: "60 s, now 30 s"."""
 
     def words(value: Any, format_number: Callable[[Any], str]) -> str:
+        """Return a value of the setting in words, with its unit; lists element by element."""
         if value is None:
             return "all" if setting is not None and setting.absent == "all" else "none"
         if isinstance(value, str):

@@ -30,7 +30,7 @@ def make_properties(make_update: Callable[[str], Any], suffix: str = "") -> dict
 
 
 def _make_property(column: Column, update: Any, suffix: str) -> Any:
-    """Return the Blender property of a column."""
+    """Return the Blender property of a column, with its callback `update`; `suffix` ends the tooltip."""
     description = f"{column.help or column.title}{_UNITS.get(column.kind, '')}{suffix}"
     common = {"name": column.title.title().replace("Roi", "ROI"), "description": description, "update": update}
     default: Any = column.blank if column.has_constant_blank else None

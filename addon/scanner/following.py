@@ -69,15 +69,15 @@ def refresh(
 
     `changed` are the camera objects that may have changed; by default all. `aim` lets the scanner keep them aimed.
     """
-    scanner = collection.mphdrr_scanner
-    if is_writing() or not scanner.is_scanner or scanner.kind not in SCANNERS:
+    properties = collection.mphdrr_scanner
+    if is_writing() or not properties.is_scanner or properties.kind not in SCANNERS:
         return
-    kind, cameras_ = kind_of(collection), modules(collection)
+    scanner_kind, cameras_ = kind_of(collection), modules(collection)
     with writing():
-        parts = parts_of(collection, cameras_ if changed is None else changed)
-        rebuilt = bool(parts) and _refresh_modules(kind, parts, scanner, aim)
-        if changed is None or rebuilt or scanner.count != len(cameras_):
-            _update_totals(kind, scanner, [camera.mphdrr_module for camera in cameras_])
+        module_parts = parts_of(collection, cameras_ if changed is None else changed)
+        is_rebuilt = bool(module_parts) and _refresh_modules(scanner_kind, module_parts, properties, aim)
+        if changed is None or is_rebuilt or properties.count != len(cameras_):
+            _update_totals(scanner_kind, properties, [camera.mphdrr_module for camera in cameras_])
             pinholes.resize_roi(collection, cameras_)
 
 

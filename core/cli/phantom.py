@@ -150,7 +150,7 @@ def read_pose(arguments: argparse.Namespace) -> Floats:
 
 
 def _add_output(parser: argparse.ArgumentParser, make: Make) -> None:
-    """Add the options of the phantom's pose, of the grid, and of the files to write."""
+    """Add the options of the phantom's pose, the grid and the files to write; `make` builds the phantom of the options."""
     add_pose(parser)
     add = parser.add_argument
     add("--voxels", type=int, nargs="+", default=[256], metavar="N", help="voxels along x y z, or one number for all")

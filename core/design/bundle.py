@@ -87,7 +87,7 @@ class BundleAdjustment:
         return x[: len(self.sd) * len(self.system)].reshape(len(self.system), -1)
 
     def geometry(self, x: Floats) -> FittedGeometry:
-        """Return modules and points at x."""
+        """Return the modules and the points that the unknowns `x` describe."""
         changes = self.sd * self.module_parameters(x)
         system = self.system
         centers = system.centers + np.einsum("mij,mi->mj", system.frames(), changes[:, :3])

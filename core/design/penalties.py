@@ -97,7 +97,10 @@ class ModuleSeparation(Constraint):
         return np.argwhere(np.triu(distance < self.margin + 1.0, 1))
 
     def _violation(self, rows: Floats, members: Indexes, system: PinholeSystem) -> Floats:
-        """Return minus the largest gap (N, 1), mm, between two hulls along the normals of their faces, smoothed."""
+        """Return minus the largest gap (N, 1), mm, between two hulls along the normals of their faces, smoothed.
+
+        `rows` (N, 30) are the parameters of the pairs of modules, `members` (N, 2) their indices.
+        """
         pair = [(rows[:, 15 * i : 15 * i + 15], system.detector_thickness[members[:, i]]) for i in (0, 1)]
         axes = np.concatenate([_hull_normals(*module) for module in pair], axis=1)
         first, second = (axes @ _hull_corners(*module).transpose(0, 2, 1) for module in pair)  # (N, axes, corners)

@@ -97,7 +97,10 @@ def find_spots(
 
 
 def _find_in_acquisition(counts: Floats, background: Floats, lattice: PixelLattice, radii: Floats) -> tuple[Array, ...]:
-    """Return the fields of `Spots` for the images `counts` (M, n_v, n_u) of one acquisition."""
+    """Return the fields of `Spots` for the images `counts` (M, n_v, n_u) of one acquisition.
+
+    `background` (M, n_v, n_u) are the known counts besides the spots, `radii` (M,) the approximate radii of the shadows, mm.
+    """
     pitch, size = np.abs(lattice.step), np.array(lattice.shape[::-1])
     reach = np.ceil(((radii + 3 * lattice.sigma)[:, None] / pitch).max(axis=0)).astype(int) + _MARGIN
     n_u, n_v = np.minimum(2 * reach + 1, size)

@@ -490,6 +490,6 @@ def _r3_sequence(n: int, first: int = 0) -> Points:
     return points - np.floor(points)  # the remainder, several times faster than %
 
 
-def _transform(pose: Points, points: Points) -> Points:
+def _transform(pose: Floats, points: Points) -> Points:
     """Return `points` (3, N) transformed by a pose (4, 4)."""
     return pose[:3, :3] @ points + pose[:3, 3:]

@@ -90,7 +90,7 @@ def _padded_image(image: Array, response: DepthResponse) -> Array:
 
 
 def _by_place(cells: Array, response: DepthResponse) -> Array:
-    """Return `cells` (…, rows, columns) as a view (…, rows, places in a pixel, pixels)."""
+    """Return `cells` (…, rows, columns) as a view (…, rows, cells along a pixel, pixels along a row)."""
     return cells.reshape(*cells.shape[:-1], -1, response.cells_per_pixel[1]).swapaxes(-1, -2)
 
 

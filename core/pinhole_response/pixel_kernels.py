@@ -235,7 +235,10 @@ def disc_transform(x: Array) -> tuple[Array, Array]:
 
 @functools.lru_cache(maxsize=8)
 def _disc_table(end: int) -> tuple[Array, Array, float]:
-    """Return values of the disc's transform from 0 to `end`, their slopes per step of the table, and that step."""
+    """Return a table of the Fourier transform of a disc of diameter 1, by frequency from 0 to `end`.
+
+    The results are the values, 1 at 0, their slopes per step, and the step between frequencies.
+    """
     ticks = np.linspace(0, end, 64 * end + 1)
     heights = np.cos(np.pi * (np.arange(4 * end) + 0.5) / (8 * end))  # of chords, by Gauss and Chebyshev
     weights = 1 - heights**2

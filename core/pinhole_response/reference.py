@@ -37,7 +37,7 @@ def cells_to_voxels(
 
 
 def cells_to_pixels(cells: Array, response: DepthResponse) -> Array:
-    """Return the image (n_v, n_u) that the pixels sum of the cells."""
+    """Return the image (n_v, n_u): `cells`, correlated with the response's kernels, times the weights of the pixels."""
     shape = response.shape[1:]
     spectrum, image = np.fft.rfft2(cells * response.cell_weights), np.zeros(response.pixel_weights.shape)
     for kernels, weights in _node_kernels(response):

@@ -146,12 +146,12 @@ def camera_views(
 ) -> Views:
     """Return cameras (...) as `Views`, one after the other; the arguments are those of `pinhole_rays`, all tensors."""
     numbers = positions, rotations, distance, pitch, offset
-    position, rotation, distances, size, middle = (
+    position_array, rotation_array, distance_array, pitch_array, offset_array = (
         x.numpy(force=True).astype(np.float64).reshape(-1, *x.shape[positions.ndim - 1 :]) for x in numbers
     )
-    u, v, k = np.moveaxis(rotation, 2, 0)
-    centers = position + distances[:, None] * k + middle[:, :1] * u + middle[:, 1:] * v
-    return Views(position, centers, size[:, :1] * u, size[:, 1:] * v, shape)
+    u, v, k = np.moveaxis(rotation_array, 2, 0)
+    centers = position_array + distance_array[:, None] * k + offset_array[:, :1] * u + offset_array[:, 1:] * v
+    return Views(position_array, centers, pitch_array[:, :1] * u, pitch_array[:, 1:] * v, shape)
 
 
 def _camera_gradients(A: PinholeOperator, volume: Any, weights: Any, backend: Any, threads: int) -> list[Any]:

@@ -120,19 +120,19 @@ def read_counts(
     paths = [Path(path)] if isinstance(path, str | os.PathLike) else list(map(Path, path))
     if not paths:
         raise InputError("counts: expected a file, or several")
-    parts: list[Counts] = []
+    counts_of_files: list[Counts] = []
     for number, file in enumerate(paths, 1):
-        parts.append(_read_file(file, layout))
-        first, last = parts[0].shape[1:], parts[-1].shape[1:]
-        if first != last:
-            size = f"{last[0]} x {last[1]} pixels, {paths[0]} of {first[0]} x {first[1]}"
-            raise InputError(f"{file}: it holds frames of {size}; expected one size")
+        counts_of_files.append(_read_file(file, layout))
+        first_shape, last_shape = counts_of_files[0].shape[1:], counts_of_files[-1].shape[1:]
+        if first_shape != last_shape:
+            shapes_text = f"{last_shape[0]} x {last_shape[1]} pixels, {paths[0]} of {first_shape[0]} x {first_shape[1]}"
+            raise InputError(f"{file}: it holds frames of {shapes_text}; expected one size")
         tell(progress, number, len(paths))
-    counts = parts[0] if len(parts) == 1 else np.concatenate(parts).view(Counts)
-    counts.about = np.concatenate([part.about for part in parts])
+    counts = counts_of_files[0] if len(counts_of_files) == 1 else np.concatenate(counts_of_files).view(Counts)
+    counts.about = np.concatenate([file_counts.about for file_counts in counts_of_files])
     starts = counts.about[:, 4]  # as read, from the beginning of the day or of an era
     starts -= np.min(starts, initial=np.inf, where=np.isfinite(starts))
-    counts.kind = ", ".join(sorted({part.kind for part in parts} - {""}))
+    counts.kind = ", ".join(sorted({file_counts.kind for file_counts in counts_of_files} - {""}))
     counts.name = ", ".join([*(file.name for file in paths[:3]), *(["…"] if len(paths) > 3 else [])])
     return counts
 
@@ -272,30 +272,30 @@ def _read_interfile(path: Path, layout: CountsLayout) -> Counts:
         return value
 
     columns, rows = (int(number(f"matrix size [{i}]")) for i in (1, 2))
-    size, kind = int(number("number of bytes per pixel")), text("number format", "nothing").lower()
-    letter = {"unsigned integer": "u", "signed integer": "i"}.get(kind, "f" if kind.endswith("float") else "")
-    if letter + str(size) not in ("u1", "u2", "u4", "u8", "i1", "i2", "i4", "i8", "f4", "f8"):
-        raise InputError(f"number format {kind} of {size} bytes: expected integers, or floats of 4 or 8 bytes")
-    order = text("imagedata byte order").upper()
-    if size > 1 and order not in ("LITTLEENDIAN", "BIGENDIAN"):
-        raise InputError(f"imagedata byte order {order or 'missing'}: expected LITTLEENDIAN or BIGENDIAN")
-    type_ = np.dtype((">" if order == "BIGENDIAN" else "<") + letter + str(size))
-    data = _interfile_data(path, text("name of data file"))
-    skip = int(number("data offset in bytes", 2048 * number("data starting block", 0)))
-    frame = rows * columns * size
-    count = int(number("total number of images", (data.stat().st_size - skip) // frame if frame else 0))
+    n_bytes, form = int(number("number of bytes per pixel")), text("number format", "nothing").lower()
+    letter = {"unsigned integer": "u", "signed integer": "i"}.get(form, "f" if form.endswith("float") else "")
+    if letter + str(n_bytes) not in ("u1", "u2", "u4", "u8", "i1", "i2", "i4", "i8", "f4", "f8"):
+        raise InputError(f"number format {form} of {n_bytes} bytes: expected integers, or floats of 4 or 8 bytes")
+    byte_order = text("imagedata byte order").upper()
+    if n_bytes > 1 and byte_order not in ("LITTLEENDIAN", "BIGENDIAN"):
+        raise InputError(f"imagedata byte order {byte_order or 'missing'}: expected LITTLEENDIAN or BIGENDIAN")
+    number_type = np.dtype((">" if byte_order == "BIGENDIAN" else "<") + letter + str(n_bytes))
+    data_path, frame_size = _interfile_data(path, text("name of data file")), rows * columns * n_bytes
+    offset = int(number("data offset in bytes", 2048 * number("data starting block", 0)))
+    n_fitting = (data_path.stat().st_size - offset) // frame_size if frame_size else 0
+    n_frames = int(number("total number of images", n_fitting))
     keys = (f"{name} (sec)" for name in ("time per projection", "image duration", "study duration"))
     times = next((list(map(float, header[key])) for key in keys if any(header.get(key, ()))), [])
     starts = [float(start) for start in header.get("image relative start time (sec)", ()) if start]
     starts = starts or [_seconds_of_day(start) for start in header.get("image start time", ()) if start]
-    windows = int(number("number of energy windows", 1))
-    pixel = [float(text(f"scaling factor (mm/pixel) [{i}]", "nan")) for i in (1, 2)]
-    kind = f"{windows} energy windows" if windows > 1 else ""
-    frames = _file_numbers(data, type_, (count, rows, columns), skip)
-    limits: Any = {"window": range(1, windows + 1)}
+    n_windows = int(number("number of energy windows", 1))
+    pixel_size = [float(text(f"scaling factor (mm/pixel) [{i}]", "nan")) for i in (1, 2)]
+    content = f"{n_windows} energy windows" if n_windows > 1 else ""
+    frames = _file_numbers(data_path, number_type, (n_frames, rows, columns), offset)
+    limits: Any = {"window": range(1, n_windows + 1)}
     for name, word in (("low", "lower"), ("high", "upper")):
         limits[name] = [float(text(f"energy window {word} level [{i}]", "nan")) for i in limits["window"]]
-    return _checked_frames(frames, kind, time=times, pixel=pixel, start=starts, **limits)
+    return _checked_frames(frames, content, time=times, pixel=pixel_size, start=starts, **limits)
 
 
 def _seconds_of_day(text: str) -> float:
@@ -330,25 +330,25 @@ def _read_dicom(path: Path, layout: CountsLayout) -> Counts:
     """Return the frames of a nuclear medicine image (DICOM part 3, C.8.4.8): planar images or projections."""
     import pydicom
 
-    data = pydicom.dcmread(path)
-    if (modality := data.get("Modality")) != "NM":
+    dataset = pydicom.dcmread(path)
+    if (modality := dataset.get("Modality")) != "NM":
         raise InputError(f"modality {modality or 'missing'}: expected nuclear medicine (NM) with a frame a module")
-    if image_kind(data) in TOMOGRAMS or "SliceVector" in data:
+    if image_kind(dataset) in TOMOGRAMS or "SliceVector" in dataset:
         raise InputError("it holds a reconstructed tomogram; expected a frame a module")
-    require_grey(data)
-    shape = int(data.get("NumberOfFrames") or 1), int(data.Rows), int(data.Columns)
+    require_grey(dataset)
+    shape = int(dataset.get("NumberOfFrames") or 1), int(dataset.Rows), int(dataset.Columns)
     _require_memory(shape, 4)
-    array = decode_pixels(data).reshape(shape)
-    slope, intercept = float(data.get("RescaleSlope") or 1), float(data.get("RescaleIntercept") or 0)
+    frames = decode_pixels(dataset).reshape(shape)
+    slope, intercept = float(dataset.get("RescaleSlope") or 1), float(dataset.get("RescaleIntercept") or 0)
     if (slope, intercept) != (1.0, 0.0):
-        array = array * slope + intercept
-    numbers = {name: int(data.get(f"NumberOf{name.replace(' ', '')}s") or 1) for name in _VECTORS}
-    kind = ", ".join(f"{n} {name.lower()}s" for name, n in numbers.items() if n > 1)
-    pixel = [float(size) for size in data.get("PixelSpacing") or (math.nan, math.nan)][::-1]
-    windows = _frame_parts(data, "Energy Window", numbers["Energy Window"])
-    low, high = ([_window_limit(data, number, word) for number in windows] for word in ("Lower", "Upper"))
-    times, starts = _frame_durations(data), _frame_starts(data, len(array))
-    return _checked_frames(array, kind, time=times, pixel=pixel, window=windows, start=starts, low=low, high=high)
+        frames = frames * slope + intercept
+    vector_sizes = {name: int(dataset.get(f"NumberOf{name.replace(' ', '')}s") or 1) for name in _VECTORS}
+    content = ", ".join(f"{n} {name.lower()}s" for name, n in vector_sizes.items() if n > 1)
+    pixel = [float(size) for size in dataset.get("PixelSpacing") or (math.nan, math.nan)][::-1]
+    windows = _frame_parts(dataset, "Energy Window", vector_sizes["Energy Window"])
+    low, high = ([_window_limit(dataset, number, word) for number in windows] for word in ("Lower", "Upper"))
+    times, starts = _frame_durations(dataset), _frame_starts(dataset, len(frames))
+    return _checked_frames(frames, content, time=times, pixel=pixel, window=windows, start=starts, low=low, high=high)
 
 
 _VECTORS = ("Energy Window", "Detector", "Phase", "Rotation", "RR Interval", "Time Slot")

@@ -240,7 +240,8 @@ def _whole_numbers(values: Any) -> list[int | None]:
 def _exposures(time: Any, counts: Counts, used: list[int], labels: list[str]) -> float | list[float]:
     """Return the exposures, s, of the modules whose frames are `used`, one number if they are equal.
 
-    Raises `InputError` if an exposure is missing, or contradicts the file's.
+    `time` is the user's, one number or one per module, or None for the file's; `labels` name the frames in messages. Raises
+    `InputError` if an exposure is missing, or contradicts the file's.
     """
     exposures = counts.about[used, 0]
     if time is None:

@@ -29,7 +29,7 @@ _ENCRYPTED = "EncryptedPackage".encode("utf-16-le")
 
 
 class OutdatedValue(NamedTuple):
-    """Stand-in for the value of a formula that stores another value than it gives."""
+    """Stand-in for a formula's value: the file's stored one differs from the one computed from the cells."""
 
     stored: Any
     computed: Any

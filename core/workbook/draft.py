@@ -112,17 +112,17 @@ def _add_guesses(
     tables: list[MappedTable], sheets: dict[str, Sheet], definitions: ColumnTable, missing: list[str]
 ) -> None:
     """Add columns whose headings may name a missing column, to the table with the same rows if there is one."""
-    used = {(table.sheet, c.column) for table in tables for c in table.columns}
+    used_columns = {(table.sheet, c.column) for table in tables for c in table.columns}
     for name in missing:
         guesses = (guess for sheet in sheets.values() for guess in _guess_columns(sheet, definitions, name))
-        guess = next((guess for guess in guesses if (guess.sheet, guess.columns[0].column) not in used), None)
+        guess = next((guess for guess in guesses if (guess.sheet, guess.columns[0].column) not in used_columns), None)
         if guess is None:
             continue
-        used.add((guess.sheet, guess.columns[0].column))
-        rows = (guess.sheet, guess.first_row, guess.last_row)
-        same = [i for i, table in enumerate(tables) if (table.sheet, table.first_row, table.last_row) == rows]
-        if same:
-            tables[same[0]] = replace(tables[same[0]], columns=tables[same[0]].columns + guess.columns)
+        used_columns.add((guess.sheet, guess.columns[0].column))
+        row_range = (guess.sheet, guess.first_row, guess.last_row)
+        matches = [i for i, table in enumerate(tables) if (table.sheet, table.first_row, table.last_row) == row_range]
+        if matches:
+            tables[matches[0]] = replace(tables[matches[0]], columns=tables[matches[0]].columns + guess.columns)
         else:
             tables.append(guess)
 

@@ -292,7 +292,7 @@ def _find_position(value: Any, cells: list[Any], mode: Any) -> int:
 
 
 def _vlookup(value: _Term, cells: _Term, column: _Term, mode: _Term = lambda: 1.0) -> Any:
-    """Return the value of VLOOKUP."""
+    """Return the value of VLOOKUP: the cell in `column`, from 1, of the row whose first cell equals `value`."""
     area, j = _evaluate_area(cells), int(_to_number(column()))
     if not 1 <= j <= area.columns:
         raise _ErrorValue(CellError("#REF!" if j > 0 else "#VALUE!"))

@@ -151,7 +151,7 @@ def _match_rows(modules: HeadedTable, table: HeadedTable) -> tuple[int, ...]:
 
 
 def _find_notes(layout: WorkbookLayout, recognized: RecognizedTables) -> Iterator[str]:
-    """Yield the warnings that a person should have of a workbook without doubts."""
+    """Yield the warnings that a user should see about a workbook whose layout is beyond doubt."""
     definitions, tables = layout.modules.definitions, list(dict.fromkeys(recognized.tables.values()))
     modules = recognized.tables[definitions.leading]
     unknown = {t.sheet.address(*position): text for t in tables for position, text in t.unknown_headings()}

@@ -111,11 +111,11 @@ class WorkbookXml:
         comments: dict[Position, str] = {}
         for member in self._related_members(sheet, "comments"):
             position = None
-            for e in self.package.elements(member):
-                if e.name == "comment" and (cell := parse_reference(e.attributes.get("ref", ""))) is not None:
+            for node in self.package.elements(member):
+                if node.name == "comment" and (cell := parse_reference(node.attributes.get("ref", ""))) is not None:
                     position = cell.top, cell.left
-                elif e.name == "t" and position is not None:
-                    comments[position] = comments.get(position, "") + e.text
+                elif node.name == "t" and position is not None:
+                    comments[position] = comments.get(position, "") + node.text
         return comments
 
     @cached_property

@@ -164,7 +164,7 @@ def _overlaps(system: Scanner, m: int, hulls: Hulls, names: list[str], depths: d
 
 
 def _panels_in_view(system: Scanner, pinholes: PinholeSystem, panels: Sequence[ModulePart]) -> list[Finding]:
-    """Return the panels between a pinhole module's hole and its ROI."""
+    """Return a finding for each panel that stands between a pinhole module's hole and its ROI."""
     hulls = Hulls.from_parts(panels)
     hulls.numbers[:] = -1 - np.arange(len(panels))  # unlike the modules' numbers
     blocked = find_blocked(pinholes, hulls)

@@ -92,14 +92,14 @@ def draw_picture(judgement: Judgement) -> Page:
     page = Page(_WIDTH, 120 + _ROW * len(judgement.pictures) + (120 + _LINE * len(ratios) if ratios else 0))
     top = heading(page, "Judgement", ["Middle slices across z; NRMSE by that of the best baseline, 95 % intervals"])
     for title, volumes in judgement.pictures:
-        _slices(page, title, volumes, top)
+        _draw_slices(page, title, volumes, top)
         top += _ROW
     if ratios:
-        _ratios(page, ratios, top + 40)
+        _draw_ratios(page, ratios, top + 40)
     return page
 
 
-def _slices(page: Page, title: str, volumes: list[tuple[str, Volume]], top: int) -> None:
+def _draw_slices(page: Page, title: str, volumes: list[tuple[str, Volume]], top: int) -> None:
     """Draw the middle slices of a test's volumes in a row, in the truth's colour window."""
     side = min(_ROW - 50, (page.width - 100) // len(volumes) - 20)
     display, truth = Display("inferno"), volumes[0][1].array
@@ -112,7 +112,7 @@ def _slices(page: Page, title: str, volumes: list[tuple[str, Volume]], top: int)
         page.image(display.colored(values.T[::-1], window), left, top + 30, side, side)
 
 
-def _ratios(page: Page, rows: list[dict[str, Any]], top: int) -> None:
+def _draw_ratios(page: Page, rows: list[dict[str, Any]], top: int) -> None:
     """Draw the ratios of NRMSE to the best baseline's with their intervals, one line per row of the table."""
     ends = [end for row in rows for end in row["best_baseline"]["ratio"]]
     low, high = min(0.7, *ends), max(1.1, *ends)

@@ -8,7 +8,7 @@ from ...rays.linear_operator import LinearOperator
 
 
 class ScipyOperator(ScipyLinearOperator):
-    """Projector between flat arrays."""
+    """Projector as a SciPy `LinearOperator`, from flat volumes to flat images in float32."""
 
     def __init__(self, A: LinearOperator) -> None:
         self._operator = A

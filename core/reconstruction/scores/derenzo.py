@@ -63,7 +63,7 @@ class RodProfile:
 
 @dataclass(frozen=True, eq=False)
 class DerenzoSector:
-    """Score of one sector. Unknown numbers are NaN, and `note` gives the reason."""
+    """Score of one sector of a Derenzo phantom. Unknown numbers are NaN, and `note` gives the reason."""
 
     rod_diameter: float
     """Diameter of the sector's rods, mm."""

@@ -26,7 +26,7 @@ _POINTS = 8  # number of points of a region per face area of the smallest voxels
 
 @dataclass(frozen=True, eq=False)
 class NemaSphere:
-    """Score of one sphere."""
+    """Score of one sphere of a NEMA body phantom."""
 
     diameter: float
     """Inner diameter, mm."""

@@ -7,6 +7,7 @@ from it go to `work_folder`.
 
 from __future__ import annotations
 
+import functools
 import json
 import os
 import shutil
@@ -41,7 +42,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 def real_blender(
     *arguments: str | Path, home: Path, network: bool = False, timeout: float = 300
 ) -> subprocess.CompletedProcess[str]:
-    """The script with these arguments, in its own mount namespace and, by default, without network.
+    """Run the script with these arguments, in its own mount namespace and, by default, without network.
 
     The script does not unmount our folder, and takes whatever is mounted there for ours: once the folder was
     deleted and created again, it would show the deleted one. In a namespace of its own the mounts end with it.
@@ -73,7 +74,7 @@ def _emptied(folder: Path) -> Path:
 
 @pytest.fixture(scope="session")
 def extension_zip() -> Path:
-    """The built zip for Linux; it must be of this tree."""
+    """Return the built zip for Linux; it must be of this tree."""
     version = tomllib.loads((ROOT / "blender_manifest.toml").read_text())["version"]
     path = ROOT / "dist" / f"mphdrr-{version}-linux_x64.zip"
     if not path.is_file():
@@ -87,7 +88,7 @@ def extension_zip() -> Path:
 
 @pytest.fixture(scope="session")
 def home(extension_zip: Path) -> Path:
-    """A clean home of Blender with the extension installed from the zip and enabled."""
+    """Return a clean home of Blender with the extension installed from the zip and enabled."""
     subprocess.run([REAL_BLENDER, "setup"], check=True, capture_output=True)
     folder = _emptied(OUTPUT / f"home-{os.environ.get('PYTEST_XDIST_WORKER', 'alone')}")
     run_blender("--command", "extension", "install-file", "-r", "user_default", "-e", extension_zip, home=folder)
@@ -96,34 +97,25 @@ def home(extension_zip: Path) -> Path:
 
 @pytest.fixture
 def work_folder(home: Path, request: pytest.FixtureRequest) -> Path:
-    """An empty folder of this test's own that Blender sees at the same path."""
+    """Return an empty folder of this test's own that Blender sees at the same path."""
     return _emptied(OUTPUT / request.node.name.replace("/", "-"))
 
 
 @pytest.fixture
 def blender(home: Path) -> Run:
-    """`blender(*arguments, check=True, network=False, timeout=300)`: run it with the extension and return its output."""
-
-    def run(*arguments: str | Path, **options: float) -> subprocess.CompletedProcess[str]:
-        return run_blender(*arguments, home=home, **options)
-
-    return run
+    """Return `blender(*arguments, check=True, network=False, timeout=300)`: it runs with the extension, for its output."""
+    return functools.partial(run_blender, home=home)
 
 
 @pytest.fixture
 def new_blender(request: pytest.FixtureRequest) -> Run:
-    """Like `blender`, in a clean home of the test's own, without the extension."""
-    folder = _emptied(OUTPUT / f"home-{request.node.name}")
-
-    def run(*arguments: str | Path, **options: float) -> subprocess.CompletedProcess[str]:
-        return run_blender(*arguments, home=folder, **options)
-
-    return run
+    """Return a `blender` in a clean home of the test's own, without the extension."""
+    return functools.partial(run_blender, home=_emptied(OUTPUT / f"home-{request.node.name}"))
 
 
 @pytest.fixture
 def blender_script(blender: Run, work_folder: Path) -> Run:
-    """`blender_script(text, *arguments)`: run Python in a windowless Blender; an exception in it fails the test."""
+    """Return `blender_script(text, *arguments)`: it runs Python in a windowless Blender; an exception fails the test."""
 
     def run(text: str, *arguments: str | Path, **options: float) -> subprocess.CompletedProcess[str]:
         script = work_folder / "script.py"
@@ -135,7 +127,7 @@ def blender_script(blender: Run, work_folder: Path) -> Run:
 
 @pytest.fixture
 def window(home: Path, work_folder: Path) -> Callable[..., dict[str, Any]]:
-    """`window(name, *arguments)`: take the steps of window_NAME.py in a Blender with its window; return what it has seen.
+    """Return `window(name, *arguments)`: it takes the steps of window_NAME.py in Blender's window and returns its `seen`.
 
     The window is closed when the script says that it has ended, and at the latest after some minutes; "screen" is then a
     PNG of the whole screen, and nothing may have gone wrong, in the script or in what Blender printed.

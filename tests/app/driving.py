@@ -1,11 +1,10 @@
-"""What the scripts in the window share: its editors, keys and mouse, pictures, and the steps that they take.
+"""What the scripts in the window share: its editors and panels, and the steps that they take.
 
 A script's arguments stand after ``--``: the folder for its files, then its own, `ARGUMENTS`. `seen` is what its test gets.
 """
 
 import itertools
 import json
-import subprocess
 import sys
 import time
 import traceback
@@ -15,8 +14,6 @@ from pathlib import Path
 from types import ModuleType
 
 import bpy
-from bpy_extras.view3d_utils import location_3d_to_region_2d
-from mathutils import Euler
 
 folder, *ARGUMENTS = map(Path, sys.argv[sys.argv.index("--") + 1 :])
 WORKBOOK = Path(bpy.utils.user_resource("EXTENSIONS")) / "user_default/mphdrr/examples/dc-spect-80.xlsx"
@@ -25,31 +22,31 @@ bpy.context.preferences.view.show_splash = False
 
 
 def ours(name: str) -> ModuleType:
-    """A module of the extension, such as ``"addon.runs.runs"``."""
+    """Return a module of the extension, such as ``"addon.runs.runs"``."""
     return import_module(f"bl_ext.user_default.mphdrr.{name}")
 
 
 def editor(kind: str = "VIEW_3D"):
-    """Window, area and region of the largest editor of a kind."""
+    """Return window, area and region of the largest editor of a kind."""
     window = bpy.context.window_manager.windows[0]
     area = max((a for a in window.screen.areas if a.type == kind), key=lambda a: a.width * a.height)
     return window, area, next(r for r in area.regions if r.type == "WINDOW")
 
 
 def within(kind: str = "VIEW_3D"):
-    """The context of that editor."""
+    """Return a context manager for the context of the largest editor of a kind."""
     window, area, region = editor(kind)
     return bpy.context.temp_override(window=window, area=area, region=region)
 
 
 def press(operator: Callable, how: str = "INVOKE_DEFAULT", kind: str = "VIEW_3D", **settings: object) -> set[str]:
-    """Call an operator as a button of that editor's sidebar does; INVOKE_DEFAULT starts a job."""
+    """Call an operator as a button of an editor's sidebar does; INVOKE_DEFAULT starts a job."""
     with within(kind):
         return operator(how, True, **settings)
 
 
 def sidebar(kind: str = "VIEW_3D"):
-    """The sidebar's region."""
+    """Return the region of an editor's sidebar."""
     return next(region for region in editor(kind)[1].regions if region.type == "UI")
 
 
@@ -59,13 +56,13 @@ def open_tab(kind: str = "VIEW_3D") -> None:
 
 
 def panels() -> list:
-    """Our panels' classes, each after the one that it is in."""
+    """Return our panels' classes, each after the one that it is in."""
     found = [getattr(bpy.types, name) for name in dir(bpy.types) if name.startswith("MPHDRR_PT_")]
     return sorted(found, key=lambda cls: hasattr(cls, "bl_parent_id"))
 
 
 def only(*names: str) -> None:
-    """Only these panels are there, open, so that all of them is on the screen."""
+    """Remove all panels but these, and open these, so that all of them is on the screen."""
     for cls in reversed(panels()):
         if cls.__name__ not in names and "INSTANCED" not in getattr(cls, "bl_options", ()):
             bpy.utils.unregister_class(cls)
@@ -84,83 +81,25 @@ def opened(*names: str, but_closed: tuple[str, ...] = ()) -> None:
         bpy.utils.register_class(cls)
 
 
-def xdotool(*what: object) -> None:
-    """Mouse and keyboard."""
-    subprocess.run(["xdotool", *map(str, what)], check=True)
-
-
-def proposed() -> str:
-    """What the button at the top of the tab says."""
-    return ours("addon.next_step").next_step(bpy.context).text
-
-
-def click_proposed(first: int = 44) -> None:
-    """Click on that button; `first` is how far below the sidebar's top, in pixels, that of an empty scene is."""
-    region, window = sidebar(), editor()[0]
-    down = first if proposed() == "Load Example" else 160
-    xdotool("mousemove", round(region.x + 0.4 * region.width), window.height - region.y - region.height + down)
-    xdotool("click", 1)
-
-
-def on_screen(x: float, y: float, kind: str = "VIEW_3D") -> tuple[int, int]:
-    """Where on the screen a place of an editor's region is."""
-    window, _, region = editor(kind)
-    return round(region.x + x), round(window.height - 1 - region.y - y)
-
-
-def frame(kind: str = "VIEW_3D") -> list[int]:
-    """Left, top, right and bottom of an editor's region on the screen."""
-    region = editor(kind)[2]
-    return [*on_screen(0, region.height, kind), *on_screen(region.width, 0, kind)]
-
-
-def place(point) -> tuple[int, int]:
-    """Where on the screen a place in the world is, in the 3D view."""
-    region = editor()[2]
-    return on_screen(*location_3d_to_region_2d(region, region.data, point))
-
-
-def look(distance: float, angles=(0.0, 0.0, 0.0), at=(0.0, 0.0, 0.0)) -> None:
-    """Look at a place from these angles, without perspective."""
-    view = editor()[2].data
-    view.view_perspective, view.view_rotation = "ORTHO", Euler(angles).to_quaternion()
-    view.view_location, view.view_distance = at, distance
-
-
-def keys(*names: str) -> None:
-    """Type keys with the mouse in the middle of the 3D view."""
-    _, _, region = editor()
-    xdotool("mousemove", *on_screen(region.width // 2, region.height // 2))
-    for name in names:
-        xdotool("key", "--delay", "60", name)
-
-
-def picture(name: str) -> Path:
-    """Capture the screen in the folder."""
-    path = folder / f"{name}.png"
-    subprocess.run(["import", "-window", "root", str(path)], check=True)
-    return path
-
-
 def empty_scene() -> None:
-    """Without the objects of the start-up file."""
+    """Remove the objects of the start-up file."""
     for name in ("Cube", "Light", "Camera"):
         bpy.data.objects.remove(bpy.data.objects[name])
 
 
 def scanner():
-    """The first scanner's collection."""
+    """Return the first scanner's collection."""
     return next(c for c in bpy.data.collections if c.mphdrr_scanner.is_scanner)
 
 
 def module(number: int, within=None):
-    """The camera of a module, of the first scanner or the one given."""
+    """Return the camera of a module, of the first scanner or of the one in `within`."""
     items = (within or scanner()).all_objects
     return next(o for o in items if o.mphdrr_module.is_module and o.mphdrr_module.number == number)
 
 
 def is_idle() -> bool:
-    """Whether no job is running."""
+    """Return whether no job is running."""
     has_modal = len(bpy.context.window_manager.windows[0].modal_operators) > 0
     return not has_modal and not ours("addon.blender.jobs").is_running()
 
@@ -172,14 +111,6 @@ def idle() -> Iterator[float]:
         yield 0.3
 
 
-def escape_asks() -> Iterator[float]:
-    """Escape asks whether to keep or to discard what the job has made, and it goes on; the question is closed unanswered."""
-    keys("Escape")
-    yield 1.0
-    seen["asked"] = ours("addon.blender.jobs").is_running()
-    keys("Escape")
-
-
 def drawn(times: int = 2) -> Iterator[float]:
     """Wait until all has been drawn anew, which takes seconds in software: timers run between two drawings."""
     for _ in range(times):
@@ -187,40 +118,6 @@ def drawn(times: int = 2) -> Iterator[float]:
             for area in window.screen.areas:
                 area.tag_redraw()
         yield 0.1
-
-
-beats: list[float] = []
-
-
-def own_time() -> float:
-    """Seconds, without those in which this thread could run but other work had the processor (Linux counts them)."""
-    try:
-        waited = int(Path("/proc/thread-self/schedstat").read_text().split()[1])
-    except OSError:
-        waited = 0
-    return time.perf_counter() - waited * 1e-9
-
-
-def beat() -> float:
-    """A timer whose pauses are measured; it also notes the words of jobs."""
-    beats.append(own_time())
-    current = ours("addon.blender.jobs")._current
-    if current is not None and current.text not in seen["words"]:
-        seen["words"].append(current.text)
-    return 0.02
-
-
-def longest_pause() -> float:
-    """The longest pause between two beats, s."""
-    return max(b - a for a, b in itertools.pairwise(beats))
-
-
-def pause_beyond_redraw() -> Iterator[float]:
-    """Yields seconds to wait; returns the longest pause since the beats were cleared, without what a redraw takes."""
-    during = longest_pause()
-    beats.clear()
-    yield from drawn(3)
-    return round(during - longest_pause(), 3)
 
 
 def run(steps: Iterator[float | Callable[[], bool]], patience: float = 120.0, settle: float = 0.0) -> None:

@@ -17,7 +17,7 @@ _SHOWN = 0.5  # s until the screen has what the script has drawn at last
 
 
 def is_done(folder: Path) -> bool:
-    """Whether the script says that it has ended."""
+    """Return whether the script says that it has ended."""
     for path in folder.rglob("*.json"):
         try:
             said = json.loads(path.read_text())
@@ -29,7 +29,7 @@ def is_done(folder: Path) -> bool:
 
 
 def main(picture: str, script: str, seconds: str, folder: str, *arguments: str) -> None:
-    """Do so."""
+    """Run a script in Blender's window, on a screen of its own."""
     width, height = SCREEN
     reading, writing = os.pipe()
     screen = subprocess.Popen(
@@ -40,7 +40,10 @@ def main(picture: str, script: str, seconds: str, folder: str, *arguments: str) 
     with os.fdopen(reading) as number:
         os.environ["DISPLAY"] = f":{number.readline().strip()}"
     place = ["--window-geometry", "0", "0", str(width), str(height)]
-    place += ["--python-expr", f"import sys; sys.path.insert(0, {str(Path(__file__).parent)!r})"]  # for driving.py
+    place += [
+        "--python-expr",
+        f"import sys; sys.path.insert(0, {str(Path(__file__).parent)!r})",
+    ]  # for what scripts import
     with open(Path(folder, "log.txt"), "w") as log:
         blender = subprocess.Popen(["blender", *place, "--python", script, "--", *arguments], stdout=log, stderr=log)
     end = time.monotonic() + float(seconds)

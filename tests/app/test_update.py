@@ -31,7 +31,7 @@ print("AFTER", version, modules, len(bpy.context.scene.mphdrr_projections.runs))
 
 
 def renumbered(path: Path, made: Path, version: str) -> None:
-    """A zip under another version's number."""
+    """Copy a zip under another version's number."""
     with zipfile.ZipFile(path) as given, zipfile.ZipFile(made, "w") as new:
         for entry in given.infolist():
             data = given.read(entry)

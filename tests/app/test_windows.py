@@ -21,7 +21,7 @@ PAGE = ROOT / "docs" / "tutorial.md"
 
 
 def pixels(path: Path) -> np.ndarray:
-    """A picture as integers (rows, columns, 3)."""
+    """Return a picture as integers (rows, columns, 3)."""
     return np.asarray(Image.open(path).convert("RGB")).astype(int)
 
 
@@ -170,12 +170,12 @@ def test_slices_shells_and_maps(window, work_folder):
     left, top, right, bottom = seen["frame"]
 
     def picture(name: str) -> np.ndarray:
-        """The middle of the 3D view, away from its buttons."""
+        """Return the middle of the 3D view, away from its buttons."""
         screen = pixels(work_folder / f"{name}.png")
         return screen[top + 60 : bottom - 20, left + 170 : right - 60]
 
     def colored(name: str, saturation: float = 0.15) -> tuple[np.ndarray, np.ndarray]:
-        """Hue in degrees, and where a picture has colours."""
+        """Return a picture's hue in degrees, and where it has colours."""
         hsv = np.asarray(Image.fromarray(picture(name).astype(np.uint8)).convert("HSV")).astype(float)
         return hsv[..., 0] * 360 / 255, (hsv[..., 1] > 255 * saturation) & (hsv[..., 2] > 60)
 
@@ -206,7 +206,7 @@ def test_the_example_is_seen_and_tiles_planes_list_and_mosaic_show_one_module(wi
     screen = pixels(seen["screen"])
 
     def lit(tile) -> float:
-        """The share of a tile's left edge that is white."""
+        """Return the share of a tile's left edge that is white."""
         left, top, _, bottom = map(round, tile)
         return float((screen[top + 4 : bottom - 4, left - 2 : left + 3].min(axis=2).max(axis=1) > 200).mean())
 
@@ -261,7 +261,7 @@ def test_a_frustum_and_a_back_projection_are_seen(window, work_folder):
 
 
 def purple(picture: Path, low: np.ndarray, high: np.ndarray) -> int:
-    """How many pixels between two places have the colours of activity."""
+    """Return the number of pixels between two places that have the colours of activity."""
     red, green, blue = np.moveaxis(pixels(picture)[low[1] : high[1], low[0] : high[0]], 2, 0)
     return int(((blue > green + 30) & (red > green + 30)).sum())
 
@@ -332,7 +332,7 @@ SIZE = "360x240"
 
 
 def ssim(a: np.ndarray, b: np.ndarray, side: int = 8) -> float:
-    """Structural similarity of two grey pictures (0 to 255), mean over windows of side x side pixels (Wang et al. 2004)."""
+    """Return the mean SSIM of two grey pictures (0 to 255) over windows of side x side pixels (Wang et al. 2004)."""
     a, b = (np.lib.stride_tricks.sliding_window_view(np.asarray(p, float), (side, side)) for p in (a, b))
     mean_a, mean_b = a.mean(axis=(2, 3)), b.mean(axis=(2, 3))
     covariance = (a * b).mean(axis=(2, 3)) - mean_a * mean_b

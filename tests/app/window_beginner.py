@@ -6,13 +6,14 @@ With the example, and in a new scene with a workbook.
 from collections.abc import Iterator
 
 import bpy
-from driving import WORKBOOK, click_proposed, drawn, editor, idle, open_tab, picture, proposed, run, seen
+from driving import WORKBOOK, drawn, editor, idle, open_tab, run, seen
+from pointing import click_proposed, picture, proposed
 
 _MOST = 6
 
 
 def clicks(name: str) -> Iterator[float]:
-    """Click until a score stands; yields what to wait for."""
+    """Click until a score stands; yield what to wait for."""
     scene, seen[name] = bpy.context.scene, []
     scene.mphdrr_reconstruction.voxels, scene.mphdrr_reconstruction.iterations = 32, 4  # for speed
     while not scene.mphdrr_reconstruction.details.get("scores") and len(seen[name]) < _MOST:
@@ -25,7 +26,7 @@ def clicks(name: str) -> Iterator[float]:
 
 
 def steps():
-    """Yields seconds to wait, or a function that says when it has happened."""
+    """Yield seconds to wait, or a function that says when it has happened."""
     editor()[1].spaces.active.show_region_ui = True
     yield 1
     open_tab()

@@ -3,7 +3,8 @@
 import json
 
 import bpy
-from driving import ARGUMENTS, drawn, editor, folder, module, on_screen, picture, press, run, seen, xdotool
+from driving import ARGUMENTS, drawn, editor, folder, module, press, run, seen
+from pointing import on_screen, picture, xdotool
 
 (workbook,) = ARGUMENTS
 
@@ -17,7 +18,7 @@ def scanners():
 
 
 def steps():
-    """Yields what to wait for: seconds, or a function that says when it has happened."""
+    """Yield what to wait for: seconds, or a function that says when it has happened."""
     region = editor()[2]
     xdotool("mousemove", *on_screen(region.width // 2, region.height // 2))
     yield 1

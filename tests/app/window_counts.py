@@ -12,7 +12,7 @@ def areas(kind: str):
 
 
 def steps():
-    """Yields how many seconds Blender may take before the next step."""
+    """Yield the seconds that Blender may take before the next step."""
     bpy.ops.mphdrr.import_geometry(filepath=str(WORKBOOK))
     counts = folder / "counts.npy"
     picture = np.zeros((80, 32, 32), int)

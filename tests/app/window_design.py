@@ -1,22 +1,9 @@
 """Design in the window: keys and undo as a user's; leaves the window while a module is being moved."""
 
 import bpy
-from driving import (
-    WORKBOOK,
-    drawn,
-    editor,
-    empty_scene,
-    keys,
-    module,
-    open_tab,
-    opened,
-    press,
-    run,
-    scanner,
-    seen,
-    within,
-)
+from driving import WORKBOOK, drawn, editor, empty_scene, module, open_tab, opened, press, run, scanner, seen, within
 from mathutils import Euler
+from pointing import keys
 
 
 def state(number: int) -> dict[str, object]:
@@ -51,7 +38,7 @@ def meshes() -> int:
 
 
 def moved(number: int, by: tuple[float, float, float]):
-    """Whether a module has come to `by` from where it was at first, and its readouts with it."""
+    """Return a function: whether a module has moved by `by` from where it was at first, and its readouts with it."""
     start = seen["before"]["place"]
 
     def is_there() -> bool:
@@ -63,10 +50,15 @@ def moved(number: int, by: tuple[float, float, float]):
 
 
 def steps():
-    """Yields what to wait for: seconds, or a function that says when it has happened."""
+    """Yield what to wait for: seconds, or a function that says when it has happened."""
     empty_scene()
     bpy.ops.mphdrr.import_geometry("EXEC_DEFAULT", True, filepath=str(WORKBOOK))
-    show()
+    opened("MPHDRR_PT_design")
+    space = editor()[1].spaces.active
+    space.show_region_ui = True
+    view = space.region_3d
+    view.view_distance, view.view_location = 620, (110, 40, 0)
+    view.view_rotation = Euler((1.05, 0, 0.95)).to_quaternion()
     yield from drawn()
     open_tab()
     select(3)
@@ -120,16 +112,6 @@ def steps():
     keys("g", "x", "4", "0")  # still moving when the picture is taken
     yield moved(3, (40, 0, 0))
     seen["moving"] = state(3)
-
-
-def show() -> None:
-    """The scanner, and the Design panels open."""
-    opened("MPHDRR_PT_design")
-    space = editor()[1].spaces.active
-    space.show_region_ui = True
-    view = space.region_3d
-    view.view_distance, view.view_location = 620, (110, 40, 0)
-    view.view_rotation = Euler((1.05, 0, 0.95)).to_quaternion()
 
 
 run(steps(), settle=0.7)

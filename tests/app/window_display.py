@@ -4,11 +4,12 @@ import time
 
 import bpy
 import numpy as np
-from driving import drawn, editor, is_idle, open_tab, press, run, seen, xdotool
+from driving import drawn, editor, is_idle, open_tab, press, run, seen
+from pointing import xdotool
 
 
 def place_of(number: int) -> tuple[int, int, int, int]:
-    """Left, top, right and bottom of a module's tile on the screen."""
+    """Return left, top, right and bottom of a module's tile on the screen."""
     window, area, region = editor("IMAGE_EDITOR")
     image = area.spaces.active.image
     tiles = image["mphdrr_tiles"].to_dict()
@@ -22,7 +23,7 @@ def place_of(number: int) -> tuple[int, int, int, int]:
 
 
 def active() -> list[int]:
-    """The numbers of the active module and of the one in the panel's list."""
+    """Return the numbers of the active module and of the one in the panel's list."""
     scene = bpy.context.scene
     item = bpy.context.view_layer.objects.active
     listed = scene.mphdrr_geometry.scanner.all_objects[scene.mphdrr_geometry.active_index]
@@ -30,7 +31,7 @@ def active() -> list[int]:
 
 
 def steps():
-    """Yields seconds to wait."""
+    """Yield seconds to wait."""
     started = time.monotonic()
     editor()[1].spaces.active.show_region_ui = True
     press(bpy.ops.mphdrr.load_example)  # the empty panel's first button

@@ -3,22 +3,9 @@
 import bpy
 import numpy as np
 from bpy_extras.view3d_utils import location_3d_to_region_2d, region_2d_to_origin_3d, region_2d_to_vector_3d
-from driving import (
-    WORKBOOK,
-    drawn,
-    editor,
-    idle,
-    on_screen,
-    open_tab,
-    opened,
-    ours,
-    own_time,
-    picture,
-    press,
-    run,
-    seen,
-    xdotool,
-)
+from driving import WORKBOOK, drawn, editor, idle, open_tab, opened, ours, press, run, seen
+from pauses import own_time
+from pointing import on_screen, picture, xdotool
 
 core, epipolar, epipolar_drawing = map(
     ours, ("core", "addon.perspective.epipolar", "addon.perspective.epipolar_drawing")
@@ -30,7 +17,7 @@ BLUE = np.array([0x47, 0x72, 0xB3])  # of Blender's sliders
 
 
 def place_of(number: int, pixel: tuple[float, float]) -> tuple[int, int]:
-    """Where on the screen a module's tile has a pixel."""
+    """Return the position on the screen of a pixel of a module's tile."""
     _, area, region = editor("IMAGE_EDITOR")
     image = area.spaces.active.image
     (tile,) = (each for each in tiles.shown_pictures(image) if each.number == number)
@@ -39,7 +26,7 @@ def place_of(number: int, pixel: tuple[float, float]) -> tuple[int, int]:
 
 
 def slider() -> tuple[int, int]:
-    """A place in the filled part of the slider in the Image Editor's sidebar, which is the widest blue there."""
+    """Return a place in the filled part of the slider in the Image Editor's sidebar, the widest blue there."""
     window, area, _ = editor("IMAGE_EDITOR")
     sidebar = next(region for region in area.regions if region.type == "UI")
     shot = bpy.data.images.load(str(picture("slider")))
@@ -56,13 +43,13 @@ def slider() -> tuple[int, int]:
 
 
 def pixel() -> list[float]:
-    """The number of the module and its pixel that are picked."""
+    """Return the picked pixel after the number of its module."""
     found = epipolar.picked_pixel(bpy.context.scene)
     return [found.run.numbers[found.index], *found.pixel.tolist()]
 
 
 def steps():
-    """Yields seconds to wait."""
+    """Yield seconds to wait."""
     opened("MPHDRR_PT_epipolar_of_images", but_closed=("MPHDRR_PT_display_of_images", "MPHDRR_PT_runs_of_images"))
     press(bpy.ops.mphdrr.load_example)
     yield from idle()
@@ -75,14 +62,7 @@ def steps():
     b = np.linalg.norm(system.centers[NUMBER - 1])
     point = core.points_at_depths(views, NUMBER - 1, PIXEL, SHARE * b)
     seen["point"] = point.tolist()
-    press(
-        bpy.ops.mphdrr.add_points,
-        "EXEC_DEFAULT",
-        counts=(1, 1, 1),
-        diameter=6.0,
-        voxels=24,
-        location=point.tolist(),
-    )
+    press(bpy.ops.mphdrr.add_points, "EXEC_DEFAULT", counts=(1, 1, 1), diameter=6.0, voxels=24, location=point.tolist())
     yield from idle()
     settings = scene.mphdrr_projections
     settings.volume = bpy.context.object
@@ -95,18 +75,13 @@ def steps():
     yield from drawn()
     open_tab("IMAGE_EDITOR")
     yield from drawn()
-    press(
-        bpy.ops.image.view_zoom_ratio, "EXEC_DEFAULT", kind="IMAGE_EDITOR", ratio=2.0
-    )  # a pixel is some of the screen's then
+    # A pixel is several of the screen's then.
+    press(bpy.ops.image.view_zoom_ratio, "EXEC_DEFAULT", kind="IMAGE_EDITOR", ratio=2.0)
     yield from drawn()
     start = np.array(place_of(NUMBER, PIXEL))
     middle = np.array(on_screen(region.width / 2, region.height / 2, "IMAGE_EDITOR"))
-    press(
-        bpy.ops.image.view_pan,
-        "EXEC_DEFAULT",
-        kind="IMAGE_EDITOR",
-        offset=(np.array([1, -1]) * (start - middle) / 2).tolist(),
-    )
+    offset = (np.array([1, -1]) * (start - middle) / 2).tolist()
+    press(bpy.ops.image.view_pan, "EXEC_DEFAULT", kind="IMAGE_EDITOR", offset=offset)
     yield from drawn()
     press(bpy.ops.mphdrr.pick_pixel, kind="IMAGE_EDITOR")
     yield 0.5

@@ -1,36 +1,19 @@
 """Events of a recipe in the window: tried on the phantom, made as a set (cancelled, then gone on with), one opened."""
 
 import bpy
-from driving import (
-    WORKBOOK,
-    beat,
-    beats,
-    editor,
-    folder,
-    only,
-    open_tab,
-    ours,
-    pause_beyond_redraw,
-    press,
-    run,
-    seen,
-    within,
-)
+from driving import WORKBOOK, editor, folder, only, open_tab, ours, press, run, seen, within
+from pauses import beat, beats, pause_beyond_redraw
 
 jobs, runs, event_notes = map(ours, ("addon.blender.jobs", "addon.runs.runs", "addon.events.event_notes"))
 seen |= {"numbers": [], "poses": [], "words": [], "pauses": []}
 RECIPE = f"""
 version = 1
 seed = 4
-[system]
-file = '{WORKBOOK}'
-modules = "1-8"
-[detector]
-rows = 64
-columns = 64
-[truth]
-voxels = 64
-spacing = 1.5
+system = {{ file = '{WORKBOOK}', modules = "1-8" }}
+detector = {{ rows = 64, columns = 64 }}
+truth = {{ voxels = 64, spacing = 1.5 }}
+models = {{ lines = {{ kind = "transmission" }} }}
+radon = {{ angles = 32 }}
 [[phantoms]]
 kind = "derenzo"
 radius = {{ from = 28, to = 36 }}
@@ -45,10 +28,6 @@ disk_radius = {{ from = 20, to = 30 }}
 disks = {{ from = 2, to = 4 }}
 [phantoms.pose]
 turn = "uniform"
-[models.lines]
-kind = "transmission"
-[radon]
-angles = 32
 """
 
 

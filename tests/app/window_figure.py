@@ -5,11 +5,12 @@ import sys
 import time
 
 import bpy
-from driving import WORKBOOK, drawn, editor, escape_asks, folder, idle, is_idle, picture, press, run, seen
+from driving import WORKBOOK, drawn, editor, folder, idle, is_idle, press, run, seen
+from pointing import escape_asks, picture
 
 
 def steps():
-    """Yields seconds to wait."""
+    """Yield seconds to wait."""
     shown_in = bpy.context.preferences.view.render_display_type
     bpy.ops.mphdrr.import_geometry(filepath=str(WORKBOOK))
     bpy.ops.mphdrr.add_derenzo(voxels=48)

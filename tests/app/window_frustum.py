@@ -1,13 +1,14 @@
 """A phantom as one module sees it, from aside and from its pinhole, and a back-projection; a picture of each."""
 
 import bpy
-from driving import WORKBOOK, drawn, editor, idle, look, only, open_tab, picture, place, press, run, seen
+from driving import WORKBOOK, drawn, editor, idle, only, open_tab, press, run, seen
+from pointing import look, picture, place
 
 MODULE = 27
 
 
 def steps():
-    """Yields seconds to wait."""
+    """Yield seconds to wait."""
     for name in ("Cube", "Light", "Camera"):
         bpy.data.objects[name].hide_set(True)
     space = editor()[1].spaces.active

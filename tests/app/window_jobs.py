@@ -6,21 +6,8 @@ from pathlib import Path
 import addon_utils
 import bpy
 import numpy as np
-from driving import (
-    WORKBOOK,
-    beat,
-    beats,
-    drawn,
-    editor,
-    folder,
-    open_tab,
-    ours,
-    pause_beyond_redraw,
-    press,
-    run,
-    seen,
-    within,
-)
+from driving import WORKBOOK, drawn, editor, folder, open_tab, ours, press, run, seen, within
+from pauses import beat, beats, pause_beyond_redraw
 
 jobs = ours("addon.blender.jobs")
 seen |= {"gaps": {}, "words": [], "changed": []}
@@ -48,7 +35,7 @@ def measured(name: str, operator, **settings):
 
 
 def state() -> dict[str, object]:
-    """Names, users, custom properties and pixels of the file's data, and the run file."""
+    """Return names, users, custom properties and pixels of the file's data, and the run file."""
     found: dict[str, object] = {}
     for kind in ("objects", "images", "collections", "cameras", "meshes", "materials", "volumes", "texts"):
         for item in getattr(bpy.data, kind):
@@ -64,7 +51,7 @@ def state() -> dict[str, object]:
 
 
 def cancelled(stage: str, operator, **settings):
-    """Cancel a job in a stage; what is in the file is as before."""
+    """Cancel a job in a stage, and note what differs in the file from before."""
     before = state()
     start(operator, **settings)
     while jobs._current is not None and jobs._current.stage != stage:

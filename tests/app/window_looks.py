@@ -1,11 +1,12 @@
 """A look is dragged from the Asset Browser onto a phantom with slices; leaves the window as it is then."""
 
 import bpy
-from driving import drawn, editor, empty_scene, idle, look, on_screen, picture, press, run, seen, within, xdotool
+from driving import drawn, editor, empty_scene, idle, press, run, seen, within
+from pointing import look, on_screen, picture, xdotool
 
 
 def brightest(item) -> list[float]:
-    """The colour of the brightest pixel of the slices."""
+    """Return the colour of the brightest pixel of the slices."""
     pixels = [
         child.data.materials[0].node_tree.nodes["Slice"].image.pixels[:]
         for child in item.children
@@ -16,7 +17,7 @@ def brightest(item) -> list[float]:
 
 
 def steps():
-    """Yields seconds to wait, or a function that says when it has happened."""
+    """Yield seconds to wait, or a function that says when it has happened."""
     empty_scene()
     press(bpy.ops.mphdrr.add_derenzo, voxels=48, confirmed=True)
     yield from idle()

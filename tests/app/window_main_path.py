@@ -3,12 +3,13 @@
 import math
 
 import bpy
-from driving import WORKBOOK, drawn, editor, empty_scene, folder, open_tab, place, press, run, seen
+from driving import WORKBOOK, drawn, editor, empty_scene, folder, open_tab, press, run, seen
 from mathutils import Euler
+from pointing import place
 
 
 def steps():
-    """Yields seconds to wait."""
+    """Yield seconds to wait."""
     empty_scene()
     bpy.ops.mphdrr.import_geometry(filepath=str(WORKBOOK))
     press(bpy.ops.mphdrr.add_derenzo, "EXEC_DEFAULT", voxels=128, theta=math.radians(55), phi=math.radians(30))

@@ -1,7 +1,8 @@
 """Commands found by the menus' search (F3) and started from it; leaves the search for "projection" open."""
 
 import bpy
-from driving import WORKBOOK, drawn, editor, on_screen, press, run, seen, xdotool
+from driving import WORKBOOK, drawn, editor, press, run, seen
+from pointing import on_screen, xdotool
 
 
 def search() -> None:
@@ -17,7 +18,7 @@ def model() -> str:
 
 
 def steps():
-    """Yields how many seconds Blender may take before the next step."""
+    """Yield the seconds that Blender may take before the next step."""
     bpy.ops.mphdrr.import_geometry(filepath=str(WORKBOOK))
     camera = bpy.data.objects["Module 05"]
     camera.rotation_euler.x += 0.2

@@ -1,11 +1,12 @@
 """How tall the tab is with everything open, after the example was reconstructed, in pixels."""
 
 import bpy
-from driving import drawn, editor, idle, open_tab, opened, panels, picture, press, run, seen, sidebar
+from driving import drawn, editor, idle, open_tab, opened, panels, press, run, seen, sidebar
+from pointing import picture
 
 
 def steps():
-    """Yields seconds to wait."""
+    """Yield seconds to wait."""
     press(bpy.ops.mphdrr.load_example, "EXEC_DEFAULT")
     settings = bpy.context.scene.mphdrr_reconstruction
     settings.voxels, settings.iterations = 48, 2

@@ -1,7 +1,9 @@
 """Phantoms in the window: a slider is dragged, which is undone, a torso beats; leaves the window while it plays."""
 
 import bpy
-from driving import editor, empty_scene, keys, own_time, run, seen, within
+from driving import editor, empty_scene, run, seen, within
+from pauses import own_time
+from pointing import keys
 
 
 def phantom():
@@ -29,7 +31,7 @@ def has_length(length: float):
 
 
 def steps():
-    """Yields what to wait for: seconds, or a function that says when it has happened."""
+    """Yield what to wait for: seconds, or a function that says when it has happened."""
     empty_scene()
     area = editor()[1]
     area.spaces.active.show_region_ui = True

@@ -2,7 +2,9 @@
 
 import bpy
 import numpy as np
-from driving import drawn, editor, folder, idle, on_screen, open_tab, ours, own_time, picture, press, run, seen, xdotool
+from driving import drawn, editor, folder, idle, open_tab, ours, press, run, seen
+from pauses import own_time
+from pointing import on_screen, picture, xdotool
 
 core, preview, volumes = (ours(name) for name in ("core", "addon.runs.preview", "addon.volumes.volumes"))
 images = ours("addon.pictures.images")
@@ -11,7 +13,7 @@ MOVES = 50
 
 
 def timed(function):
-    """The function, its time added to that of the move."""
+    """Wrap a function so that its time is added to that of the move."""
 
     def run(*arguments):
         started = own_time()
@@ -51,7 +53,7 @@ def figures(name, times):
 
 
 def at_rest() -> bool:
-    """Whether the preview has all pixels of what there is."""
+    """Return whether the preview has all pixels of what there is."""
     shown = preview.session().preview
     return shown is not None and not shown.is_quick
 

@@ -1,13 +1,14 @@
 """Counts of a few modules are reconstructed in the window: what is seen while it runs, then finished early."""
 
 import bpy
-from driving import WORKBOOK, editor, escape_asks, idle, only, open_tab, ours, press, run, seen
+from driving import WORKBOOK, editor, idle, only, open_tab, ours, press, run, seen
+from pointing import escape_asks
 
 seen |= {"iterations": []}
 
 
 def steps():
-    """Yields seconds to wait."""
+    """Yield seconds to wait."""
     editor()[1].spaces.active.show_region_ui = True
     press(bpy.ops.mphdrr.import_geometry, "EXEC_DEFAULT", filepath=str(WORKBOOK))
     press(bpy.ops.mphdrr.add_derenzo, "EXEC_DEFAULT", voxels=48)

@@ -5,7 +5,7 @@ from driving import WORKBOOK, editor, press, run, seen, within
 
 
 def steps():
-    """Yields seconds to wait."""
+    """Yield seconds to wait."""
     press(bpy.ops.mphdrr.import_geometry, "EXEC_DEFAULT", filepath=str(WORKBOOK))
     with within():
         bpy.ops.object.select_all(action="DESELECT")

@@ -1,13 +1,14 @@
 """Two runs of the example in the window: a module is moved and moved back, the run is rendered again, both are compared."""
 
 import bpy
-from driving import drawn, editor, idle, open_tab, ours, own_time, press, run, seen
+from driving import drawn, editor, idle, open_tab, ours, press, run, seen
+from pauses import own_time
 
 runs = ours("addon.runs.runs")
 
 
 def move() -> None:
-    """With the tool, 1 mm up: an undo step."""
+    """Move the active object by 1 mm up with Blender's tool, which makes an undo step."""
     for item in bpy.context.selected_objects:
         item.select_set(False)
     camera = bpy.data.objects["Module 30"]
@@ -21,7 +22,7 @@ def changes(when: str) -> None:
 
 
 def steps():
-    """Yields seconds to wait."""
+    """Yield seconds to wait."""
     editor()[1].spaces.active.show_region_ui = True
     press(bpy.ops.mphdrr.load_example)
     yield from idle()

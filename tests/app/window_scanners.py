@@ -3,22 +3,9 @@
 import bpy
 import numpy as np
 from bpy_extras.view3d_utils import location_3d_to_region_2d
-from driving import (
-    WORKBOOK,
-    drawn,
-    editor,
-    empty_scene,
-    keys,
-    module,
-    on_screen,
-    open_tab,
-    press,
-    run,
-    seen,
-    within,
-    xdotool,
-)
+from driving import WORKBOOK, drawn, editor, empty_scene, module, open_tab, press, run, seen, within
 from mathutils import Matrix, Vector
+from pointing import keys, on_screen, xdotool
 
 
 def mouse(x: float, y: float, *then: str) -> None:
@@ -31,7 +18,7 @@ def part(name: str, number: int, kind: str):
 
 
 def state() -> dict[str, object]:
-    """Where module 30 of A is, and its crystal on it; the panels' scanner, the listed and the active module."""
+    """Return places of module 30 of A and its crystal, the panels' scanner, and the listed and the active module."""
     camera, crystal = module(30, bpy.data.collections["A"]), part("A", 30, "CRYSTAL")
     geometry = bpy.context.scene.mphdrr_geometry
     on_camera = np.abs(np.array(camera.matrix_world) - np.array(crystal.matrix_world)).max()
@@ -48,7 +35,7 @@ def state() -> dict[str, object]:
 
 
 def moved(x: float, y: float, z: float):
-    """Whether module 30 of A is that far from where it was at first, and at rest."""
+    """Return a function: whether module 30 of A is that far from where it was at first, and at rest."""
     start = seen["before"]["place"]
 
     def is_there() -> bool:
@@ -68,13 +55,13 @@ def look_at_back(name: str, number: int) -> None:
 
 
 def view() -> list[float]:
-    """How the 3D view looks at the scene."""
+    """Return the 3D view's clipping distances, its distance and its location."""
     space = editor()[1].spaces.active
     return [space.clip_start, space.clip_end, space.region_3d.view_distance, *space.region_3d.view_location]
 
 
 def free_place(point: Vector) -> list[float]:
-    """Where in the part of the 3D view that toolbar and sidebar leave free a point is, from 0 to 1."""
+    """Return a point's place, from 0 to 1, in the part of the 3D view that toolbar and sidebar leave free."""
     _, area, region = editor()
     x, y = location_3d_to_region_2d(region, area.spaces.active.region_3d, point)
     tools, sidebar = (next(r for r in area.regions if r.type == kind).width for kind in ("TOOLS", "UI"))
@@ -93,7 +80,7 @@ def click_on(item) -> None:
 
 
 def steps():
-    """Yields what to wait for: seconds, or a function that says when it has happened."""
+    """Yield what to wait for: seconds, or a function that says when it has happened."""
     empty_scene()
     yield 1
     area = editor()[1]

@@ -9,23 +9,8 @@ from collections.abc import Callable
 
 import bpy
 import numpy as np
-from driving import (
-    drawn,
-    editor,
-    folder,
-    is_idle,
-    keys,
-    module,
-    open_tab,
-    opened,
-    picture,
-    press,
-    run,
-    scanner,
-    seen,
-    sidebar,
-    xdotool,
-)
+from driving import drawn, editor, folder, is_idle, module, open_tab, opened, press, run, scanner, seen, sidebar
+from pointing import keys, picture, xdotool
 
 STEPS: list[Callable] = []
 
@@ -37,7 +22,7 @@ def mouse(x: float, y: float, *buttons: int) -> None:
 
 
 def scroll(down: int):
-    """Turn the wheel over the sidebar, down, or up where negative; yields what to wait for."""
+    """Turn the wheel over the sidebar, down, or up where negative; yield what to wait for."""
     region = sidebar()
     top = region.view2d.region_to_view(0, 0)[1]
     middle = editor()[0].height - region.y - region.height / 2
@@ -47,17 +32,12 @@ def scroll(down: int):
 
 
 def totals() -> dict[int, float]:
-    """The sum of each module's image, from the exact images in the .blend."""
+    """Return the sum of each module's image, from the exact images in the .blend."""
     images = {i.name: i for i in bpy.data.images}
     return {n: float(np.asarray(images[f"mphDRR {n:02d}"].pixels[:])[::4].sum()) for n in (54, 55)}
 
 
-def step(function: Callable) -> Callable:
-    STEPS.append(function)
-    return function
-
-
-@step
+@STEPS.append
 def load():
     opened("MPHDRR_PT_design", "MPHDRR_PT_projections", "MPHDRR_PT_export")
     _, area, _ = editor("VIEW_3D")
@@ -74,7 +54,7 @@ def load():
     return [f"{scanner().mphdrr_scanner.count} modules", f"{rings} rings", f"{len(planes)} projections", "Derenzo"]
 
 
-@step
+@STEPS.append
 def tile():
     window, area, region = editor("IMAGE_EDITOR")
     image = area.spaces.active.image
@@ -86,7 +66,7 @@ def tile():
     return [module(55).name]
 
 
-@step
+@STEPS.append
 def look():
     view = editor("VIEW_3D")[1].spaces.active.region_3d
     seen["view"] = [view.view_distance, *view.view_location, *view.view_rotation]
@@ -96,7 +76,7 @@ def look():
     return [bpy.context.scene.camera.name]
 
 
-@step
+@STEPS.append
 def change():
     view, kept = editor("VIEW_3D")[1].spaces.active.region_3d, seen.pop("view")
     view.view_perspective, view.view_distance = "PERSP", kept[0]
@@ -113,7 +93,7 @@ def change():
     return [*before, f"{numbers.sensitivity:.2f} cps/MBq", f"{numbers.resolution:.2f} mm", "4 mm"]
 
 
-@step
+@STEPS.append
 def render():
     settings = bpy.context.scene.mphdrr_projections
     settings.model, settings.time = "EMISSION", 60.0
@@ -126,7 +106,7 @@ def render():
     return [f"{counts[55] / counts[54]:.1f} times", "SPECT Counts", "60", "128"]
 
 
-@step
+@STEPS.append
 def display():
     before = totals()
     settings = bpy.context.scene.mphdrr_display
@@ -140,7 +120,7 @@ def display():
     return ["Viridis", "Square Root"]
 
 
-@step
+@STEPS.append
 def export():
     keys("Escape")  # the popover closes
     yield 1

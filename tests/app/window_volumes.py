@@ -1,27 +1,12 @@
 """Volumes in the window: NEMA's slices and shell, an arrow that is dragged, a map; a picture of each."""
 
 import bpy
-from driving import (
-    WORKBOOK,
-    drawn,
-    editor,
-    frame,
-    look,
-    on_screen,
-    open_tab,
-    ours,
-    picture,
-    place,
-    press,
-    run,
-    seen,
-    within,
-    xdotool,
-)
+from driving import WORKBOOK, drawn, editor, open_tab, ours, press, run, seen, within
+from pointing import frame, look, on_screen, picture, place, xdotool
 
 
 def steps():
-    """Yields seconds to wait."""
+    """Yield seconds to wait."""
     color_bar, slices = ours("addon.perspective.color_bar"), ours("addon.volumes.slices")
     for name in ("Cube", "Light", "Camera"):
         bpy.data.objects[name].hide_set(True)

@@ -1,13 +1,14 @@
 """From a clean home to CT, SPECT with it, and dose, by clicks on the buttons that the tab proposes."""
 
 import bpy
-from driving import click_proposed, drawn, editor, idle, open_tab, ours, picture, proposed, run, seen
+from driving import drawn, editor, idle, open_tab, ours, run, seen
+from pointing import click_proposed, picture, proposed
 
 _FIRST = 78  # pixels from the sidebar's top to the button of the X-ray example
 
 
 def steps():
-    """Yields seconds to wait, or a function that says when it has happened."""
+    """Yield seconds to wait, or a function that says when it has happened."""
     editor()[1].spaces.active.show_region_ui = True
     yield 1
     open_tab()

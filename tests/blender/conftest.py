@@ -33,7 +33,7 @@ WORKBOOK = Path(__file__).parents[2] / "examples" / "dc-spect-80.xlsx"
 
 @pytest.fixture(scope="session")
 def registered() -> Iterator[None]:
-    """The extension in Blender with its own preferences and add-ons: to register it takes longer than a scene."""
+    """Register the extension in a Blender of factory settings, once: it takes longer than a scene."""
     bpy.ops.wm.read_factory_settings()
     registration.register()
     yield
@@ -42,7 +42,7 @@ def registered() -> Iterator[None]:
 
 @pytest.fixture(autouse=True)
 def scene(registered: None) -> Iterator[bpy.types.Scene]:
-    """A fresh factory scene; what was going on in the one before has ended, as when the extension is disabled."""
+    """Yield a fresh factory scene; then stop all that is going on, as when the extension is disabled."""
     bpy.ops.wm.read_homefile(use_factory_startup=True)
     shutil.rmtree(Path(bpy.app.tempdir, "mphdrr"), ignore_errors=True)
     yield bpy.context.scene
@@ -57,13 +57,13 @@ def workbook() -> Path:
 
 @pytest.fixture(scope="session")
 def dc_spect() -> PinholeSystem:
-    """The real scanner: 80 modules in 4 rings."""
+    """Return the real scanner: 80 modules in 4 rings."""
     return read_system(WORKBOOK)
 
 
 @pytest.fixture(scope="session")
 def small_workbook(dc_spect, tmp_path_factory) -> Path:
-    """The real scanner's first 16 modules in a workbook of the same layout."""
+    """Write the real scanner's first 16 modules into a workbook of the same layout."""
     path = tmp_path_factory.mktemp("workbook") / "small.xlsx"
     write_system(dc_spect[:16], path)
     return path
@@ -71,7 +71,7 @@ def small_workbook(dc_spect, tmp_path_factory) -> Path:
 
 @pytest.fixture
 def ring_system() -> PinholeSystem:
-    """Two rings of four modules of different sizes: small, and nothing in it symmetric."""
+    """Return two rings of four modules of different sizes: small, and nothing in it symmetric."""
     angle = np.radians([-80.0, -20.0, 35.0, 120.0])
     radius = np.array([180.0, 210.0, 195.0, 240.0])
     ring = np.stack([radius * np.cos(angle), radius * np.sin(angle), np.full(4, -30.0)], axis=1)
@@ -82,7 +82,7 @@ def ring_system() -> PinholeSystem:
 
 @pytest.fixture
 def ring(scene, ring_system) -> bpy.types.Collection:
-    """The scanner of `ring_system` in the scene."""
+    """Build the scanner of `ring_system` in the scene."""
     collection = scanner.build_scanner(scene, ring_system, "Ring")
     update()
     return collection
@@ -90,14 +90,14 @@ def ring(scene, ring_system) -> bpy.types.Collection:
 
 @pytest.fixture
 def imported(scene, small_workbook) -> bpy.types.Collection:
-    """The scanner of the small workbook in the scene."""
+    """Import the scanner of the small workbook into the scene."""
     assert bpy.ops.mphdrr.import_geometry(filepath=str(small_workbook)) == {"FINISHED"}
     return scanner.active_scanner(scene)
 
 
 @pytest.fixture
 def derenzo(ring) -> bpy.types.Object:
-    """A small phantom in the ring of eight modules, off centre and rotated; it is active."""
+    """Add a small phantom to the ring of eight modules, off centre and rotated; it is active."""
     bpy.ops.mphdrr.add_derenzo(voxels=32, rod_diameters=(10, 8, 0, 0, 0, 0), location=(5, -3, 2), phi=0.2, theta=0.3)
     return bpy.context.object
 

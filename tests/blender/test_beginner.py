@@ -29,7 +29,7 @@ BUTTON = 200  # pixels that whatever has a text asks for, however long that is, 
 
 
 class Settings:
-    """Stands for the settings of an operator's button; those that do not exist cannot be set."""
+    """Stand-in for the settings of an operator's button; those that do not exist cannot be set."""
 
     def __init__(self, known: Any) -> None:
         vars(self).update(known=known)
@@ -39,7 +39,7 @@ class Settings:
 
 
 class Layout:
-    """Stands for Blender's layout: remembers what is drawn, and shares out the width as Blender does."""
+    """Stand-in for Blender's layout: it remembers what is drawn, and shares out the width as Blender does."""
 
     def __init__(self, kind: str = "column", factor: float = 0.0, **settings: Any) -> None:
         self.kind, self.factor, self.items = kind, factor, []
@@ -121,22 +121,22 @@ class Layout:
         raise AttributeError(name)
 
     def leaves(self) -> Iterator[dict[str, Any]]:
-        """All that is drawn."""
+        """Yield all that is drawn."""
         for item in self.items:
             yield from item.leaves() if isinstance(item, Layout) else [item]
 
     def wanted(self) -> float:
-        """The width that it asks for."""
+        """Return the width that the layout asks for."""
         widths = self._widths() or [0.0]
         return sum(widths) if self.kind == "row" else max(widths)
 
     def _widths(self) -> list[float]:
-        """The widths that its items ask for."""
+        """Return the widths that the items ask for."""
         asked = (lambda item: BUTTON if item["text"] else ICON) if self.alignment == "EXPAND" else _needed
         return [item.wanted() if isinstance(item, Layout) else asked(item) for item in self.items]
 
     def cut(self, width: float) -> Iterator[str]:
-        """The texts for which there is not enough room."""
+        """Yield the texts for which there is not enough room."""
         wanted = self._widths()
         for k, (item, asked) in enumerate(zip(self.items, wanted, strict=True)):
             if self.kind == "grid":
@@ -191,7 +191,7 @@ def names(seen: dict[str, Layout], *what: str) -> list[str]:
 
 
 def check(seen: dict[str, Layout]) -> None:
-    """Everything is explained, and no text is cut."""
+    """Check that everything is explained, and no text is cut."""
     leaves = [leaf for layout in seen.values() for leaf in layout.leaves()]
     assert not [leaf for leaf in leaves if not leaf.get("explained", True)]
     assert not {name: cut for name, layout in seen.items() if (cut := list(layout.cut(WIDTH)))}
@@ -207,7 +207,7 @@ def test_an_empty_tab_shows_three_buttons(scene):
 
 @pytest.fixture
 def worked(scene, dc_spect) -> Any:
-    """A scene with a scanner, a phantom, a run and its reconstruction."""
+    """Return a scene with a scanner, a phantom, a run and its reconstruction."""
     scanner.build_scanner(scene, dc_spect[:8])
     bpy.ops.mphdrr.add_derenzo(voxels=12)
     bpy.ops.mphdrr.render_projections(width=8, height=8)

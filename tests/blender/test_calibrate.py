@@ -33,7 +33,7 @@ def nominal(dc_spect) -> mph.PinholeSystem:
 
 @pytest.fixture(scope="module")
 def images(nominal):
-    """Counts (5, 8, 32, 32) of modules off by 1 mm and 0.5 degrees; those of one are upside down."""
+    """Return counts (5, 8, 32, 32) of modules off by 1 mm and 0.5 degrees; those of one are upside down."""
     rng = np.random.default_rng(3)
     off = {"centers": nominal.centers + rng.normal(0, 1, (8, 3)), "tilt": np.radians(rng.normal(0, 0.5, (8, 3)))}
     true = nominal.replace(**off)

@@ -27,7 +27,7 @@ CM = {"x1": "Mitte x (Zentimeter)", "y1": "Mitte y (Zentimeter)", "z1": "Mitte z
 
 @pytest.fixture
 def unread(small_workbook, tmp_path) -> Path:
-    """The small workbook with its coordinates in cm under headings that the reader does not know."""
+    """Write the small workbook with its coordinates in cm under headings that the reader does not know."""
     book = openpyxl.load_workbook(small_workbook, data_only=True)
     sheet = book["Coordinates"]
     for column in range(sheet.max_column, 4, -1):
@@ -51,7 +51,7 @@ def small(small_workbook) -> PinholeSystem:
 
 @pytest.fixture
 def columns(unread) -> ColumnMap:
-    """The column map that a person would give."""
+    """Return the column map that a person would give."""
     return ColumnMap.from_toml(
         """
         [[tables]]
@@ -288,7 +288,7 @@ ADDED = (
 
 @pytest.fixture
 def typed(scene, ring_system, monkeypatch):
-    """A scanner whose table has three more columns, one of each module's own values."""
+    """Yield a scanner whose table has three more columns, one of each module's own values."""
     registration.unregister()
     monkeypatch.setattr(PinholeSystem, "columns", PinholeSystem.columns.with_columns(*ADDED))
     registration.register()

@@ -20,7 +20,7 @@ from .conftest import datablocks, move, part, refused, reopened, select, update
 
 @pytest.fixture
 def roi_system(ring_system) -> PinholeSystem:
-    """`ring_system` with the lengths of the design formula."""
+    """Return `ring_system` with the lengths of the design formula."""
     return ring_system.replace(collimator_length=formula_lengths(ring_system))
 
 
@@ -44,7 +44,7 @@ def depth(camera: bpy.types.Object) -> tuple[float, float]:
 
 
 def assert_consistent(collection: bpy.types.Collection) -> None:
-    """Everything shown agrees with `read_scanner`."""
+    """Check that everything shown agrees with `read_scanner`."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", InputWarning)
         system = scanner.read_scanner(collection)
@@ -386,7 +386,7 @@ def test_files_with_shared_meshes_are_loaded(collection, tmp_path):
 
 
 def hole_radii(camera: bpy.types.Object) -> dict[float, float]:
-    """Radius of the hole by the depth of its corners."""
+    """Return the radius of the hole by the depth of its corners."""
     points = np.array([v.co for v in part(camera, "COLLIMATOR").data.vertices])
     return {
         float(z): float(np.hypot(*points[points[:, 2] == z, :2].T).min())

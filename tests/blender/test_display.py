@@ -24,7 +24,7 @@ POINT = np.array([9.0, -6.0, 12.0])
 
 @pytest.fixture
 def projected(scene, ring):
-    """A scanner of eight modules and what they see of a small source that is off every axis."""
+    """Return a function that renders a small source, off every axis, with a scanner of eight modules for its planes."""
     volumes.add_volume(Volume(np.ones((2, 2, 2), np.float32), Grid.centered(2, 2.0, POINT)), "Point")
 
     def project(**settings):
@@ -36,7 +36,7 @@ def projected(scene, ring):
 
 
 def brightest(picture: bpy.types.Image) -> tuple[float, float]:
-    """Place of the brightest pixel of a picture, from 0 to 1 to the right and upwards."""
+    """Return the place of the brightest pixel of a picture, from 0 to 1 to the right and upwards."""
     values = pixels(picture)[..., :3].sum(axis=-1)
     row, column = np.unravel_index(values.argmax(), values.shape)
     return (column + 0.5) / values.shape[1], (row + 0.5) / values.shape[0]
@@ -254,7 +254,7 @@ def test_planes_of_another_scene_never_show_this_ones_run(projected, scene, ring
 
 
 def shows(display: Display) -> bool:
-    """Whether all pictures show the exact numbers so."""
+    """Return whether all pictures show the exact numbers in this way."""
     found = [images.projection_array(bpy.data.images[ids.projection_name(k, 8)]) for k in range(1, 9)]
     window = display.window(np.stack(found))
     for number, exact in enumerate(found, 1):

@@ -113,7 +113,7 @@ DEFAULTS = {
 
 
 def _registered():
-    """Every enumeration of the extension: class, property."""
+    """Yield class and property of every enumeration of the extension."""
     for cls in registration.CLASSES:
         if issubclass(cls, bpy.types.Operator):
             group, name = cls.bl_idname.split(".")

@@ -23,7 +23,7 @@ POINT = np.array([9.0, -6.0, 12.0])
 
 @pytest.fixture
 def projected(scene, ring):
-    """A scanner of eight modules and what they see of a small source that is off every axis."""
+    """Return a function that renders a small source, off every axis, in a scanner of eight modules; it returns the views."""
     volumes.add_volume(Volume(np.ones((2, 2, 2), np.float32), Grid.centered(2, 3.0, POINT)), "Point")
 
     def project(**settings):
@@ -35,7 +35,7 @@ def projected(scene, ring):
 
 
 def seen_from(run: epipolar.RunViews, number: int, point: np.ndarray) -> np.ndarray:
-    """Column, row and k of a world point in a module, from the core's perspective grid."""
+    """Return column, row and k of a world point in a module, from the core's perspective grid."""
     return PerspectiveGrid(run.views, run.numbers.index(number), 1, 1.0, 2.0).from_world(point)
 
 

@@ -37,7 +37,7 @@ def state() -> tuple:
 
 @pytest.fixture
 def example(scene, dc_spect, tmp_path):
-    """A scanner with some modules hidden, a phantom that was moved, and projections."""
+    """Return a scene of a scanner with some modules hidden, a phantom that was moved, and projections."""
     system = dc_spect[::4]
     collection = scanner.build_scanner(scene, system)
     pose = mph.euler_pose(0.3, 0.2, 0.1, (4.0, 0.0, -6.0))
@@ -177,7 +177,7 @@ def test_a_volume_is_seen_or_its_absence_is_said(example, tmp_path, look):
 
 
 def rendered(scene, capfd) -> str:
-    """What is said beside Blender's own Render, which writes its picture all the same."""
+    """Return what is said beside Blender's own Render, which writes its picture all the same."""
     path = storage.folder() / "render.png"
     path.unlink(missing_ok=True)
     scene.render.filepath = str(path)

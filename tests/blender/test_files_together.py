@@ -33,7 +33,7 @@ SMALL = {"width": 12, "height": 10}
 
 @pytest.fixture
 def study(scene, small_workbook, tmp_path) -> Path:
-    """A saved scene with a scanner, a beating volume, a run and a reconstruction; its workbook lies elsewhere."""
+    """Save a scene with a scanner, a beating volume, a run and a reconstruction; its workbook lies elsewhere."""
     tables = tmp_path / "tables"
     tables.mkdir()
     bpy.ops.mphdrr.import_geometry(filepath=shutil.copy(small_workbook, tables))
@@ -49,13 +49,13 @@ def study(scene, small_workbook, tmp_path) -> Path:
 
 
 def contents(folder: Path) -> dict[str, str]:
-    """The files below a folder, with their checksums."""
+    """Return the files below a folder, with their checksums."""
     files = [path for path in sorted(folder.rglob("*")) if path.is_file()]
     return {str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
 
 
 def held() -> dict[str, np.ndarray]:
-    """All voxels and counts that the scene's files hold."""
+    """Return all voxels and counts that the scene's files hold."""
     scene = bpy.context.scene
     found = {
         f"{item.name} {k}": volumes.reader(item, path)().array
@@ -67,7 +67,7 @@ def held() -> dict[str, np.ndarray]:
 
 
 def is_whole(top: Path, expected: dict[str, np.ndarray]) -> None:
-    """Whether the scene's files are below a folder, and hold what they did."""
+    """Check that the scene's files are below a folder, and hold what they did."""
     assert storage.missing_volumes() == []
     assert all(item.data.grids.load() for item in volumes.volume_objects(bpy.context.scene))
     named = [storage.absolute(getattr(owner, name)).resolve() for owner, name in storage.file_references()]
@@ -188,7 +188,7 @@ TANK = {"rod_diameters": (0,) * 6, "sphere_diameters": (30, 0, 0, 0, 0, 0)}  # l
 
 @pytest.fixture
 def crashed(scene, small_workbook, tmp_path, capsys):
-    """A scene with volumes of every origin, opened again after their files have gone; returns their voxels by name."""
+    """Open a scene with volumes of every origin again after their files have gone; return their voxels by name."""
     bpy.ops.mphdrr.import_geometry(filepath=str(small_workbook))
     job = phantoms.add_phantom_job(phantom_properties.plain_settings("jaszczak", voxels=24, **TANK), "Tank", None, True)
     jobs.run(job)

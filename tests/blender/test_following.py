@@ -24,7 +24,7 @@ MOTION = Matrix.Translation((4.0, -9.0, 6.5)) @ Euler((0.1, -0.2, 0.3)).to_matri
 
 @pytest.fixture
 def box(scene) -> None:
-    """A small volume of activity in the middle of the scene."""
+    """Add a small volume of activity in the middle of the scene."""
     volumes.add_volume(Volume(np.ones((2, 2, 2), np.float32), Grid.centered(2, 2.0), "activity"), "Box")
 
 
@@ -150,7 +150,7 @@ def a_and_b(scene, ring_system):
 
 
 def shown(scene: bpy.types.Scene) -> tuple[str, int, int]:
-    """The panels' scanner, and the numbers of its listed and active modules."""
+    """Return the panels' scanner, and the numbers of its listed and active modules."""
     listed, active = selection.listed_module(scene), selection.active_module(bpy.context)
     return scanner.active_scanner(scene).name, listed.mphdrr_module.number, active.mphdrr_module.number
 

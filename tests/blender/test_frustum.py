@@ -20,7 +20,7 @@ SHAPE = 18, 26  # rows, columns
 
 @pytest.fixture
 def shown(scene, derenzo):
-    """A turned phantom in a scanner of eight modules, with other pixels than square ones of a square image."""
+    """Return a turned phantom in a scanner of eight modules, whose pixels are not the square ones of a square image."""
     scene.mphdrr_projections.height, scene.mphdrr_projections.width = SHAPE
     choose(3)
     return derenzo
@@ -39,7 +39,7 @@ def choose(number: int) -> bpy.types.Object:
 
 
 def grid_of(item, system, m: int, n_k: int, uniform: str) -> mph.PerspectiveGrid:
-    """The cells that a frustum of a module should show: between the depths of the first and last voxels' corners."""
+    """Return the cells of a module's frustum: between the depths of the first and last voxels' corners."""
     views, volume = system[m : m + 1].views(SHAPE), volumes.volume_from_object(item)
     filled = np.argwhere(volume.array != 0)[:, None] + np.reshape(np.indices((2, 2, 2)), (3, -1)).T - 0.5
     places = filled @ volume.grid.affine[:3, :3].T + volume.grid.affine[:3, 3]
@@ -48,7 +48,7 @@ def grid_of(item, system, m: int, n_k: int, uniform: str) -> mph.PerspectiveGrid
 
 
 def corners(layer: bpy.types.Object) -> np.ndarray:
-    """Where the corners (2, 2, 3) of an image empty are in the world, [top, right]."""
+    """Return the corners (2, 2, 3) of an image empty in the world, [top, right]."""
     width, height = layer.data.size
     half = layer.empty_display_size / max(width, height) / 2  # a picture's longer side is as long as the empty
     matrix = np.array(layer.matrix_world, np.float64)
@@ -58,7 +58,7 @@ def corners(layer: bpy.types.Object) -> np.ndarray:
 
 
 def expected_corners(g: mph.PerspectiveGrid, plane: int) -> np.ndarray:
-    """Of the outermost pixels' outer corners, as the pinhole sees them: +u to the left."""
+    """Return the outermost pixels' outer corners as the pinhole sees them: +u to the left."""
     n_u, n_v, _ = g.shape
     return g.to_world([
         [[column - 0.5, row - 0.5, g.planes[plane]] for column in (n_u, 0)] for row in (0, n_v)

@@ -40,7 +40,7 @@ def test_unchanged_scanner_writes_the_same_file(scene, workbook, tmp_path):
 
 
 def random_edits(rng: np.random.Generator, collection: bpy.types.Collection) -> None:
-    """A user's afternoon: moves, numbers, copies, deletions."""
+    """Edit a scanner at random for a user's afternoon: moves, numbers, copies, deletions."""
     for _ in range(12):
         found = scanner.modules(collection)
         camera = found[rng.integers(len(found))]

@@ -12,7 +12,7 @@ import pytest
 from mphdrr.addon.blender import storage
 from mphdrr.addon.phantoms import phantoms
 from mphdrr.addon.phantoms.phantom_properties import plain_settings
-from mphdrr.addon.volumes import slices, stored_volumes, volume_materials, volumes
+from mphdrr.addon.volumes import slices, stored_volumes, volumes
 from mphdrr.addon.volumes.stored_volumes import store_volume
 from mphdrr.addon.volumes.vdb import openvdb, write_vdb
 from mphdrr.core.errors import InputError
@@ -158,10 +158,6 @@ def test_slices_of_a_large_volume_are_quick():
     assert min(took) < 0.1, took  # all three planes
 
 
-def test_ramps_are_of_the_quantity(ct):
-    assert volume_materials.ramp("hu") == volume_materials.ramp("mu") != volume_materials.ramp("activity")
-
-
 def test_unused_files_are_cleaned_up_and_no_others(tmp_path, ct):
     item = volumes.add_volume(ct, "CT")
     _replace(item, Volume(ct.array[:5].copy(), Grid((5, 11, 7), AFFINE), "hu"))
@@ -254,7 +250,7 @@ def test_sequence_of_what_cannot_follow_is_refused(ct):
 
 @pytest.fixture
 def two_states() -> list[Volume]:
-    """Two states of random voxels."""
+    """Return two states of random voxels."""
     arrays = np.random.default_rng(5).random((2, 9, 8, 7), np.float32)
     return [Volume(array, Grid.centered(array.shape, 10.0)) for array in arrays]
 
@@ -298,7 +294,7 @@ def test_the_current_frame_is_projected(scene, ring, ring_system, two_states):
 
 @pytest.fixture
 def halves(tmp_path) -> list[dict[str, str]]:
-    """Files whose voxels are bright at low, then at high x, both beside the isocentre; named as numbers sort."""
+    """Write files with voxels bright at low, then at high x, both beside the isocentre; their names sort as numbers do."""
     names = []
     for number, half in ((9, slice(0, 4)), (10, slice(4, 8))):
         array = np.zeros((8, 8, 8), np.float32)

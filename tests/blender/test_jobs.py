@@ -27,7 +27,7 @@ from .conftest import refused, reopened
 
 @pytest.fixture
 def scanned(derenzo):
-    """A scanner, a phantom that is active, and a run of its projections."""
+    """Make a scanner, a phantom that is active, and a run of its projections."""
     bpy.ops.mphdrr.render_projections(width=10, height=12)
 
 
@@ -35,7 +35,7 @@ _UNREAD = ("pixels", "has_data", "cycles")  # compared as an array; a cache; wit
 
 
 def everything() -> dict[str, object]:
-    """All that the file holds and beside it the run files: users, properties, custom properties and pixels."""
+    """Return all that the file holds, and the run files: users, properties, custom properties and pixels."""
     found: dict[str, object] = {}
 
     def describe(path: str, item: bpy.types.bpy_struct) -> None:
@@ -146,7 +146,7 @@ def test_only_what_is_left_unchanged_can_be_stopped(scanned):
 
 
 class Operator(jobs.JobOperator):
-    """What Blender makes an operator of, without Blender: `tick` is its timer's event."""
+    """Stand-in for the operator that Blender makes of a class: `tick` is its timer's event."""
 
     bl_label = "Test"
 

@@ -31,7 +31,7 @@ def nema(scene):
 
 
 def surface(item) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices (n, 3) in the object's space and edges (m, 2) of the surface that Blender draws."""
+    """Return vertices (n, 3) in the object's space and edges (m, 2) of the surface that Blender draws."""
     made = looks.surface_of(item)
     update()
     mesh = made.evaluated_get(bpy.context.evaluated_depsgraph_get()).data
@@ -193,6 +193,7 @@ def test_a_map_of_an_older_file_is_shown_in_the_same_unit(scene, tmp_path):
 
 def test_crystals_phantoms_maps_and_the_selection_share_no_hue(scene):
     theme = bpy.context.preferences.themes[0].view_3d
+    assert volume_materials.ramp("hu") == volume_materials.ramp("mu") != volume_materials.ramp("activity")
 
     def hues(*colors) -> np.ndarray:
         return np.array([360 * colorsys.rgb_to_hsv(*color[:3])[0] for color in colors])

@@ -19,7 +19,7 @@ def added():
 
 
 def content(volume):
-    """Value times mm^3."""
+    """Return the sum of value times mm^3."""
     return float(volume.array.sum(dtype=np.float64)) * volume.grid.voxel_volume
 
 

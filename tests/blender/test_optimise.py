@@ -14,41 +14,13 @@ from mphdrr.addon.blender import jobs
 from mphdrr.addon.scanner import optimising, scanner
 from mphdrr.core.cli import main
 
+from ..core import small_design
 from .conftest import assert_same, refused, update
 from .test_jobs import everything
 
 pytest.importorskip("scipy", reason="no scipy")
 
-TEXT = """
-version = 1
-
-[generator]
-kind = "ellipse"
-modules = 3
-semi_axes = [150, 140]
-start = 10
-end = 250
-z = [-28, 31]
-pinhole_diameter = 4
-detector_side = 50
-detector_thickness = 8
-roi_radius = 26
-
-[free]
-semi_axes = [[110, 200], [110, 200]]
-z = [[-60, -20], [20, 60]]
-pinhole_diameter = [1, 9]
-
-[[objectives]]
-kind = "detail"
-size = 8
-points = 5
-
-[search]
-starts = 1
-coarse_steps = 3
-steps = 1
-"""
+TEXT = small_design.TEXT.replace("starts = 2\ncoarse_steps = 4", "starts = 1\ncoarse_steps = 3")
 
 
 @pytest.fixture(scope="module")
@@ -65,7 +37,7 @@ def found(recipe):
 
 @pytest.fixture
 def at_once(monkeypatch, found):
-    """Searches that find it at once."""
+    """Replace the search by one that returns `found` at once."""
 
     def optimize(recipe, progress, callback):
         callback(found.start, 0.0)
@@ -76,7 +48,7 @@ def at_once(monkeypatch, found):
 
 @pytest.fixture
 def like(found):
-    """A scanner with modules of the same numbers, from a workbook."""
+    """Return a scanner with modules of the same numbers, as from a workbook."""
     return found.start.replace(pinhole_diameter=np.full(6, 3.3), roi_radius=np.full(6, 20.0))
 
 
@@ -116,7 +88,7 @@ def test_one_of_other_modules_stays_beside_it(scene, recipe, found, at_once, rin
 
 
 def moved(scene, recipe, looks: int) -> tuple[jobs.Job, list[mph.PinholeSystem]]:
-    """A job whose search is shown so many times, and the scanners that were seen."""
+    """Run a job whose search is shown so many times and then cancelled; return it and the scanners that were seen."""
     job, seen = optimising.optimize_job(scene, recipe), []
 
     def work(done, total):

@@ -42,7 +42,7 @@ def voxels_of(item) -> np.ndarray:
 
 
 def expected(phantom: Phantom, voxels: int, quantity: str = "activity") -> Volume:
-    """The phantom on a cube that contains it, in its own frame."""
+    """Return the phantom on a cube that contains it, in its own frame."""
     low, high = phantom.box
     grid = Grid.centered((voxels,) * 3, (high - low).max() / (voxels - 2), (low + high) / 2)
     return phantom.voxelize(grid, quantity=quantity)
@@ -236,14 +236,14 @@ def test_outline_goes_with_the_phantom_and_its_settings():
 
 @pytest.fixture
 def item():
-    """A phantom of two quantities, 12^3 voxels."""
+    """Add a phantom of two quantities, 12^3 voxels."""
     bpy.ops.mphdrr.add_shepp_logan(voxels=12, half_size=40, attenuation=True, location=(3, 4, 5))
     return bpy.context.object
 
 
 @pytest.fixture
 def window(monkeypatch):
-    """A window in which every phantom is too large to be made at every edit."""
+    """Pretend a window in which every phantom is too large to be made at every edit."""
     monkeypatch.setattr(windows, "has_window", lambda: True)
     monkeypatch.setattr(live_phantoms, "QUICK_VOXELS", 0)
 
@@ -253,7 +253,7 @@ def is_waiting() -> bool:
 
 
 def assert_made(item) -> None:
-    """The voxels of every quantity follow from the settings and the object's pose."""
+    """Check that the voxels of every quantity follow from the settings and the object's pose."""
     recipe = phantoms.copy_settings(phantoms.settings_of(item))
     for one in phantoms.with_children(item):
         volume = volumes.volume_from_object(one)

@@ -14,7 +14,7 @@ from mphdrr.core.rays import backends, parallel
 
 @pytest.fixture(autouse=True)
 def missing(monkeypatch, request) -> set[str]:
-    """Backends that are not there; to find out what this machine has, torch and warp would be loaded."""
+    """Pretend that backends are missing; to find out what this machine has, torch and warp would be loaded."""
     names = getattr(request, "param", {"torch", "cuda"})
 
     def require(backend: backends.Backend) -> None:
@@ -35,7 +35,7 @@ def cache(tmp_path, monkeypatch):
 
 @pytest.fixture
 def user(scene):
-    """The preferences of the add-on, enabled for a moment."""
+    """Yield the preferences of the add-on, enabled for a moment."""
     addon = bpy.context.preferences.addons.new()
     addon.module = preferences.PACKAGE
     yield addon.preferences

@@ -21,7 +21,7 @@ from .conftest import update
 
 @pytest.fixture
 def scanned(ring, derenzo, ring_system):
-    """A scanner of eight modules, the third one active, and a small phantom, off centre and rotated."""
+    """Return a scanner of eight modules, the third one active, beside a small phantom, off centre and rotated."""
     selection.select(bpy.context, [scanner.module(ring, 3)])
     return ring_system
 

@@ -46,7 +46,7 @@ def render(**settings) -> ProjectionRun:
 
 
 def _ours() -> list[str]:
-    """The exact images and the mosaic, without the modules' pictures."""
+    """Return the names of the exact images and the mosaic, without the modules' pictures."""
     names = [image.name for image in bpy.data.images if image.name.startswith("mphDRR")]
     return sorted(name for name in names if not name.endswith(" picture"))
 
@@ -72,7 +72,7 @@ def test_images_hold_exactly_what_core_projects(scanned, detector):
 
 @pytest.fixture
 def body(scanned) -> Volume:
-    """An attenuation volume in the scene, on its own grid, moved and rotated."""
+    """Add an attenuation volume to the scene, on its own grid, moved and rotated."""
     volume = Volume(np.full((4, 5, 6), 0.0154), Grid.centered((4, 5, 6), 20.0), "mu")
     item = volumes.add_volume(volume, "Body")
     item.location.x, item.rotation_euler.z = 6.0, 0.3
@@ -355,7 +355,7 @@ def test_errors_in_the_work_become_readable_reports(scanned, monkeypatch, kind, 
 
 @pytest.fixture
 def ct(scanned, scene) -> bpy.types.Object:
-    """A CT beside the phantom, active."""
+    """Add a CT beside the phantom, active."""
     array = np.full((9, 10, 11), -1000.0, np.float32)
     array[2:7, 2:7, 2:7] = 55.0
     item = volumes.add_volume(Volume(array, Grid.centered(array.shape, 8.0), "hu"), "CT")
@@ -428,7 +428,7 @@ def test_attenuation_at_another_energy_is_said(scanned, scene, source, capfd):
 
 
 def _panel(settings) -> dict:
-    """Every property of the panel, except volumes and the last run."""
+    """Return every property of the panel, except volumes and the last run."""
     values = {name: getattr(settings, name) for name in ProjectionSettings.__annotations__}
     return {k: tuple(v) if isinstance(v, bpy.types.bpy_prop_array) else v for k, v in values.items()}
 

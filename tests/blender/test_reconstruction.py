@@ -34,7 +34,7 @@ SMALL = {"voxels": 14, "spacing": 7.0, "iterations": 3, "subsets": 2}
 
 @pytest.fixture
 def render(scene, derenzo):
-    """A scanner of eight modules, a phantom and a run of counts."""
+    """Render a run of counts of a phantom in a scanner of eight modules; return a function that renders another."""
     settings = scene.mphdrr_projections
     settings.width, settings.height, settings.model, settings.time = 12, 10, "EMISSION", 600.0
 
@@ -205,7 +205,7 @@ def test_a_radiograph_is_refused_by_methods_of_counts(render):
 
 @pytest.fixture
 def in_window(monkeypatch):
-    """As in a window: what is reconstructed is shown at every step."""
+    """Pretend a window, in which what is reconstructed is shown at every step."""
     monkeypatch.setattr(reconstructions, "_MIN_INTERVAL", -1.0)
     monkeypatch.setattr(windows, "has_window", lambda: True)
     return monkeypatch

@@ -27,7 +27,7 @@ from .conftest import Drawn, module, move, refused, turn, update
 
 @pytest.fixture
 def render(scene, derenzo):
-    """A scanner of eight modules and a phantom; the result renders what the panel says."""
+    """Return a function that renders a phantom in a scanner of eight modules as the panel says."""
     settings = scene.mphdrr_projections
     settings.width, settings.height, settings.model = 12, 10, "EMISSION"
 

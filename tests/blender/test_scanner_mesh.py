@@ -31,7 +31,7 @@ def as_trimesh(vertices: np.ndarray, faces: np.ndarray):
 
 
 def frustum(a: float, b: float, height: float) -> float:
-    """Volume between two parallel squares of sides a and b."""
+    """Return the volume between two parallel squares of sides a and b."""
     return height * (a * a + a * b + b * b) / 3
 
 

@@ -19,17 +19,10 @@ from .conftest import assert_same, cycles_picture, move, reopened, turn, update
 
 
 def project(views: Views, points: np.ndarray) -> np.ndarray:
-    """(M, N, 2) columns and rows of world points (N, 3)."""
+    """Return columns and rows (M, N, 2) of world points (N, 3)."""
     homogeneous = np.concatenate([points, np.ones((len(points), 1))], axis=1)
     image = np.einsum("mij,nj->mni", views.projection_matrices(), homogeneous)
     return image[..., :2] / image[..., 2:]
-
-
-def blender_pixels(scene, camera, points: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
-    """(N, 2) columns and rows by Blender; its x grows to the right, which is -u."""
-    n_v, n_u = shape
-    seen = np.array([world_to_camera_view(scene, camera, Vector(p))[:] for p in points])
-    return np.stack([(1 - seen[:, 0]) * n_u - 0.5, seen[:, 1] * n_v - 0.5], axis=1)
 
 
 def assert_blender_agrees(scene, collection, views: Views) -> None:
@@ -37,8 +30,9 @@ def assert_blender_agrees(scene, collection, views: Views) -> None:
     inside_roi = scanner.modules(collection)[0].mphdrr_module.roi_radius / np.sqrt(3)
     points = np.random.default_rng(1).uniform(-inside_roi, inside_roi, (40, 3))
     for camera, expected in zip(scanner.modules(collection), project(views, points), strict=True):
-        got = blender_pixels(scene, camera, points, views.shape)
-        assert np.abs(got - expected).max() < 1e-3
+        x, y = np.transpose([world_to_camera_view(scene, camera, Vector(point))[:2] for point in points])
+        pixels = np.stack([(1 - x) * views.shape[1] - 0.5, y * views.shape[0] - 0.5], axis=1)  # x is along -u
+        assert np.abs(pixels - expected).max() < 1e-3
 
 
 @pytest.mark.parametrize("shape", [(256, 256), (128, 200)])
@@ -99,7 +93,7 @@ def add_emitting_sphere(center: np.ndarray, radius: float, channel: int) -> None
 
 @pytest.fixture
 def tilted(ring_system) -> PinholeSystem:
-    """Modules tilted by up to 3 degrees; one is not."""
+    """Return modules tilted by up to 3 degrees; one is not."""
     rng = np.random.default_rng(5)
     vectors = rng.normal(size=(8, 3))
     vectors *= np.radians(rng.uniform(0.5, 3.0, 8))[:, None] / np.linalg.norm(vectors, axis=1)[:, None]

@@ -163,7 +163,7 @@ def test_what_others_do_to_our_grids_counts(tmp_path, shift, mirror):
 
 
 def _centroid(path, name, spread=0.0):
-    """Position of a grid's content in other programs: OpenVDB's own transform of integer indices, which all of them use."""
+    """Return the centre of a grid's content by OpenVDB's transform of integer indices, which all programs use."""
     grid = vdb.read(str(path), name)
     first, last = grid.evalActiveVoxelBoundingBox()
     shape = tuple(b - a + 1 for a, b in zip(first, last, strict=True))

@@ -30,7 +30,7 @@ AFFINES = {
 
 @pytest.fixture
 def sparse_volume() -> Volume:
-    """Voxels with zeros, negative, tiny and huge values, in a rotated anisotropic grid."""
+    """Return voxels with zeros, negative, tiny and huge values, in a rotated anisotropic grid."""
     rng = np.random.default_rng(0)
     array = rng.normal(size=(21, 14, 9)).astype(np.float32)
     array[3:9] = 0.0

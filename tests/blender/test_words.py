@@ -20,14 +20,14 @@ FOREIGN = re.compile(COMMAND.pattern + "|" + "|".join(rf"\b{re.escape(key)}\b(?!
 
 
 def text_of(node: ast.expr) -> str:
-    """A text in code, with {} for what is put into it."""
+    """Return a text in code, with {} for what is put into it."""
     if isinstance(node, ast.JoinedStr):
         return "".join(str(part.value) if isinstance(part, ast.Constant) else "{}" for part in node.values)
     return str(node.value) if isinstance(node, ast.Constant) else "{}"
 
 
 def messages() -> dict[str, str]:
-    """What `InputError` and warnings say, by where; not those of commands."""
+    """Return the texts of `InputError` and warnings, by their places; not those of commands."""
     paths = [path for top in ("core", "addon", "operators") for path in (TOP / top).rglob("*.py")]
     return {
         f"{path.relative_to(TOP)}:{node.lineno}": text_of(node.args[0])
@@ -98,7 +98,7 @@ WORDS = ("projection", "module", "collimator", "geometry", "phantom", "volume", 
 
 
 def entries(draw, path: str) -> dict[str, list[str]]:
-    """Paths, as the search has them, of the commands in what `draw` draws and in our menus below, by their idnames."""
+    """Return the search's paths of the commands in what `draw` draws and in our menus below, by their idnames."""
     menu = MagicMock()
     draw(menu, bpy.context)
     found: dict[str, list[str]] = {}

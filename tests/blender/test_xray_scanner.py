@@ -31,7 +31,7 @@ def added(name: str, attribute: str, **more: Any) -> Column:
 
 @pytest.fixture
 def toy():
-    """A kind of scanner with columns of every kind and no checks, known while a test runs."""
+    """Yield a kind of scanner with columns of every kind and no checks, known while a test runs."""
 
     class Toy(XraySystem):
         kind: ClassVar[str] = "toy x-ray"
@@ -58,7 +58,7 @@ def toy():
 
 @pytest.fixture(params=["x-ray", "toy"])
 def system(request):
-    """Three sources with panels that are wider than high, of a kind that is shipped or of one that is not."""
+    """Return three sources with panels wider than high, of a kind that is shipped or of one that is not."""
     arc = mph.xray_arc(3, panel_size=(300, 200), shape=(20, 40), kvp=[80, 100, 120])
     if request.param == "x-ray":
         return arc
@@ -76,7 +76,7 @@ def path(system, small_workbook, tmp_path):
 
 @pytest.fixture
 def collection(scene, system, path):
-    """The X-ray scanner, imported beside the pinholes and chosen."""
+    """Import the X-ray scanner beside the pinholes and choose it."""
     assert bpy.ops.mphdrr.import_geometry(filepath=str(path)) == {"FINISHED"}
     update()
     scene.mphdrr_geometry.scanner = scanner.find_scanner(scene, f"both {system.kind}")

@@ -61,13 +61,13 @@ def workbook() -> Path:
 
 @pytest.fixture(scope="session")
 def scanner() -> PinholeSystem:
-    """The users' scanner of 80 modules."""
+    """Return the users' scanner of 80 modules."""
     return read_system(WORKBOOK)
 
 
 @pytest.fixture
 def system(rng: np.random.Generator) -> PinholeSystem:
-    """Twelve modules in two rings, all numbers different, tilted by up to 3 degrees."""
+    """Return twelve modules in two rings, all numbers different, tilted by up to 3 degrees."""
     angles = np.linspace(0.1, 5.5, 6)
     ring = np.stack([220 * np.cos(angles), 180 * np.sin(angles), np.full(6, 30.0)], axis=1)
     centers = np.concatenate([ring * [1, 1, -1], ring]) + rng.uniform(-2, 2, (12, 3))
@@ -84,7 +84,7 @@ def system(rng: np.random.Generator) -> PinholeSystem:
 
 
 def general_grid(rng: np.random.Generator, shape: tuple[int, int, int]) -> Grid:
-    """A grid whose affine is rotated, sheared, anisotropic and mirrored, around the isocentre."""
+    """Return a grid whose affine is rotated, sheared, anisotropic and mirrored, around the isocentre."""
     affine = euler_pose(*rng.uniform(-3, 3, 3))
     affine[:3, :3] @= np.array([[1.3, 0.2, 0.0], [0.0, -0.8, 0.1], [0.0, 0.0, 2.1]])
     affine[:3, 3] -= affine[:3, :3] @ (np.array(shape) - 1) / 2
@@ -92,12 +92,12 @@ def general_grid(rng: np.random.Generator, shape: tuple[int, int, int]) -> Grid:
 
 
 def voxel_centers(grid: Grid) -> np.ndarray:
-    """World places (n_x, n_y, n_z, 3) of a grid's voxels."""
+    """Return the world places (n_x, n_y, n_z, 3) of a grid's voxels."""
     return np.moveaxis(np.indices(grid.shape), 0, -1) @ grid.affine[:3, :3].T + grid.affine[:3, 3]
 
 
 def emission(system: PinholeSystem, mu: Volume | None = None, **options: Any) -> Emission:
-    """Emission with one ray to each pixel's centre, for laws of single rays; without the warning that these are too few.
+    """Return an emission of one ray to each pixel's centre, for laws of single rays, without the warning of too few.
 
     Through the middle of the hole, if nothing is said of the hole.
     """
@@ -108,7 +108,7 @@ def emission(system: PinholeSystem, mu: Volume | None = None, **options: Any) ->
 
 
 def same_matter(grid: Grid, mu: np.ndarray) -> list[Volume]:
-    """The same mu on `grid`, on a twice finer one and on a larger one."""
+    """Return the same mu on `grid`, on a twice finer one and on a larger one."""
     fine, moved = np.diag([0.5, 0.5, 0.5, 1.0]), np.eye(4)
     fine[:3, 3], moved[:3, 3] = -0.25, (-1, -2, -3)
     padding = np.array(((1, 1), (2, 0), (3, 4)))
@@ -206,21 +206,21 @@ test = 0.4
 
 @pytest.fixture(scope="session")
 def event_set(tmp_path_factory: pytest.TempPathFactory) -> events.EventSet:
-    """Five events of 8 modules, tiny."""
+    """Make five tiny events of 8 modules."""
     folder = tmp_path_factory.mktemp("events")
     return events.make(small_recipe(folder, EVENT_RECIPE), folder / "set", 5)
 
 
 @pytest.fixture(scope="session")
 def small_set(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder of eight small events, to copy."""
+    """Return the folder of eight small events, to copy."""
     folder = tmp_path_factory.mktemp("small-events")
     events.make(small_recipe(folder), folder / "set", 8)
     return folder / "set"
 
 
 def distance_to_line(points: np.ndarray, line: np.ndarray) -> np.ndarray:
-    """Distances (…) of points (…, 3) to a line, a Plücker matrix (4, 4), that is not at infinity."""
+    """Return the distances (…) of points (…, 3) to a line, a Plücker matrix (4, 4), that is not at infinity."""
     direction = line[:3, 3]
     moment = np.array([line[1, 2], line[2, 0], line[0, 1]])  # a x b
     # a x b = x x (b - a) for all points x of the line, and the matrix holds a - b.

@@ -27,13 +27,13 @@ _SETTINGS = """<?xml version="1.0" encoding="UTF-8"?>
 
 
 def program() -> str | None:
-    """The path of LibreOffice, None if it is not installed."""
+    """Return the path of LibreOffice, None if it is not installed."""
     found = shutil.which("soffice") or shutil.which("libreoffice")
     return found or next((path for path in _USUAL_PLACES if os.path.exists(path)), None)
 
 
 def recalculated(workbooks: list[bytes], suffix: str = ".xlsx", time_limit: float = TIME_LIMIT) -> list[bytes | None]:
-    """The workbooks (files' bytes) as LibreOffice saves them after calculating all their formulas.
+    """Return the workbooks (files' bytes) as LibreOffice saves them after calculating all their formulas.
 
     None for a workbook that LibreOffice did not save: it is not installed, failed, or took too long. It runs
     without a window, in a temporary folder with a profile of its own, and no macro runs.

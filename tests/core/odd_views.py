@@ -7,7 +7,7 @@ from mphdrr.core.geometry.frames import affine_matrix, module_frames
 
 
 def odd_views(parallel: bool = False) -> mph.Views:
-    """Six views of the isocentre's surroundings, each odd in another way; all have the isocentre in their image.
+    """Return six views of the isocentre's surroundings, each odd in another way; all have the isocentre in their image.
 
     Pixels of other pitch along u and v, the principal point off the centre, a turn about the axis, a mirrored grid, skewed
     pixels, an oblique detector; and one view with all of it.

@@ -62,5 +62,5 @@ RECIPE: dict[str, Any] = parse_toml(TEXT, "recipe")
 
 
 def small_design(folder: Path = Path(), **tables: Any) -> DesignRecipe:
-    """The recipe with other tables."""
+    """Return the recipe with other tables."""
     return design_recipe({**deepcopy(RECIPE), **tables}, folder)

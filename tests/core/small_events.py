@@ -69,7 +69,7 @@ def with_phantoms(entries: str, text: str = TEXT) -> str:
 
 
 def small_recipe(folder: Path, text: str = TEXT) -> EventRecipe:
-    """The recipe in a file of a folder, read."""
+    """Write the recipe into a file of a folder, and return what is read of it."""
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "small.toml").write_text(text, encoding="utf-8")
     return read_recipe(folder / "small.toml")

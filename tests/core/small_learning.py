@@ -15,7 +15,7 @@ from .small_recipes import TRAINING
 
 
 class Toy(nn.Module):
-    """Corrects OSEM's last volume by a convolution."""
+    """Network that corrects OSEM's last volume by a convolution."""
 
     may_be_0 = ()
 
@@ -39,7 +39,7 @@ class Toy(nn.Module):
 
 
 class ToyKind(NetworkKind):
-    """The row of `NETWORKS`."""
+    """Row of `NETWORKS` for the toy network."""
 
     def load(self) -> type:
         return Toy
@@ -49,12 +49,12 @@ TOY = ToyKind("Toy", "One convolution", "toy")
 
 
 def add_toy() -> None:
-    """Put it into the table of networks, for a process of its own."""
+    """Put the toy into the table of networks, for a process of its own."""
     NETWORKS["toy"] = TOY  # type: ignore[index]
 
 
 def small_training(folder: Path, events: Path, text: str = TRAINING) -> TrainingRecipe:
-    """The recipe of a training in a folder, with a copy of its set of events."""
+    """Write the recipe of a training into a folder, with a copy of its set of events."""
     shutil.copytree(events, folder / "set")
     (folder / "training.toml").write_text(text, encoding="utf-8")
     return read_recipe(folder / "training.toml")

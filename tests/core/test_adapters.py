@@ -19,7 +19,7 @@ from .conftest import emission, refused
 
 @pytest.fixture(scope="module")
 def problem(scanner):
-    """A projector of 20 modules with a background, a truth, and counts of it."""
+    """Return a projector of 20 modules with a background, a truth, and counts of it."""
     system, grid = scanner[::4], mph.Grid.centered(12, 7.0)
     model = emission(system, time=600.0, background=np.linspace(0.2, 1.5, len(system)), aperture_points=3)
     A = mph.Projector(grid, system.views((16, 14), detector="real"), model)
@@ -59,7 +59,7 @@ def pytomography(torch):
 
 @pytest.fixture
 def likelihood(problem, pytomography, torch):
-    """PyTomography's likelihood of the counts."""
+    """Return PyTomography's likelihood of the counts."""
     from pytomography.likelihoods import PoissonLogLikelihood
 
     matrix = mph.pytomography_matrix(problem.A)
@@ -67,7 +67,7 @@ def likelihood(problem, pytomography, torch):
 
 
 def close(found, expected, most=1e-4):
-    """Two volumes differ by at most this share: of the norm, and in any voxel of the largest value."""
+    """Check that two volumes differ by at most this share: of the norm, and in any voxel of the largest value."""
     found, expected = np.asarray(found, float), np.asarray(expected, float)
     assert np.linalg.norm(found - expected) <= most * np.linalg.norm(expected)
     assert np.abs(found - expected).max() <= most * np.abs(expected).max()

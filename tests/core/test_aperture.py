@@ -19,7 +19,7 @@ KNIFE = KnifeEdge(radius=1.1, mu=3.0, tangent=0.8)
 
 
 def ellipse_area(length, slope):
-    """Area, mm^2, of the pinhole's plane where a line with this slope runs less than `length` mm through the edge.
+    """Return the area, mm^2, of the pinhole's plane where lines of a slope run less than `length` mm through the edge.
 
     Its rim is an ellipse: |(t x, w y) - f| + |(t x, w y) + f| = 2 K with w^2 = t^2 - slope^2, f = (a slope, 0) and
     2 K = 2 a t + length w^2 / sqrt(1 + slope^2), from the squared distances to the two cones.
@@ -73,7 +73,7 @@ FINE, SIDE = 0.1, 8.0
 
 @functools.cache
 def voxel_image(n, fwhm):
-    """Image on fine pixels, of a sum of 1, of a voxel of 8 mm^3 at the isocentre through n points of the hole."""
+    """Return the image on fine pixels, of sum 1, of a voxel of 8 mm^3 at the isocentre through n points of the hole."""
     grid, system = turned_grid((1, 1, 1), 2.0), one_module()
     views = system.views((round(SIDE / FINE),) * 2, "real", pitch=FINE)
     image = mph.Projector(grid, views, emission(system, aperture_points=n, pixel_points=8, intrinsic_fwhm=fwhm))(
@@ -105,7 +105,7 @@ def test_points_for_a_tolerance_keep_it(fwhm):
 
 
 def flat_field(model, n=120, pitch=1.0):
-    """Image of a slab that fills the pixels' field of view."""
+    """Return the image of a slab that fills the pixels' field of view."""
     slab = mph.Grid.centered((1, 1, 1), (10, 2000, 2000))
     views = model.system.views((n, n), "real", pitch=pitch)
     return mph.Projector(slab, views, model)(np.ones((1, 1, 1)))[0].astype(float)

@@ -23,7 +23,7 @@ SYSTEM = mph.PinholeSystem(
 
 
 def doors() -> dict[str, tuple[tuple[int, ...], Callable[[Any], object]]]:
-    """Everything that takes an array of the user's: the array's shape, and the call."""
+    """Return everything that takes an array of the user's: the array's shape, and the call."""
     views = SYSTEM.views(PIXELS, "real")
     images, voxels = (len(SYSTEM), *PIXELS), GRID.shape
     A = mph.Projector(GRID, views, emission(SYSTEM, mu=mph.Volume(np.zeros(voxels), GRID, "mu")))

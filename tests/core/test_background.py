@@ -10,7 +10,7 @@ from .conftest import emission, refused
 
 @pytest.fixture
 def forms(system, rng):
-    """A background as one number, as one for each module, and as images of 4 x 6 pixels."""
+    """Return a background as one number, as one for each module, and as images of 4 x 6 pixels."""
     return 2.5, rng.uniform(0, 5, len(system)), rng.uniform(0, 5, (len(system), 4, 6))
 
 

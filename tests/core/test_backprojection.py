@@ -14,7 +14,7 @@ WAYS = ("sum", "product", "minimum")
 
 
 def odd_views(parallel: bool = False) -> mph.Views:
-    """Four views: one is upright, one turned, mirrored, leaning and off its axis, one sees half, one stands in the grid."""
+    """Return views: upright; turned, mirrored, leaning and off its axis; one that sees half; one that stands in the grid."""
     u, v, k = mph.euler_pose(0.2, 1.1, -0.4)[:3, :3].T
     sources = np.array([[0, -200, 10], -150 * k, [180, 30, 20], [2.0, 3.0, -1.5]])
     middles = np.array([[0, 300, -15], 250 * k + 9 * u - 14 * v, [-200, -60, 80], [2.0, 160.0, 31.0]])
@@ -74,7 +74,7 @@ def grid(rng) -> mph.Grid:
 
 
 def lattices(grid: mph.Grid, views: mph.Views) -> list[mph.Grid | mph.PerspectiveGrid]:
-    """Voxels, and the cells of a view and of another camera."""
+    """Return voxels, the cells of a view, and those of another camera."""
     other = mph.Views([[40, -190, 60]], [[-50, 210, -90]], [[7, 0, 1]], [[0.5, 1, -8]], (19, 21))
     return [grid, mph.PerspectiveGrid(views, 1, 12, 110, 190), mph.PerspectiveGrid(other, 0, 15, 150, 250, "depth")]
 
@@ -239,7 +239,7 @@ def test_what_is_not_understood_is_refused(rng, grid):
 
 
 def derenzo_scores(system, pixels, spacing) -> dict[tuple[str, str], mph.DerenzoScore]:
-    """Scores of Derenzo rods, back-projected from images through ideal holes, and through the scanner's."""
+    """Return scores of Derenzo rods, back-projected from images through ideal holes, and through the scanner's."""
     phantom = mph.DerenzoPhantom(40, (8, 6, 5, 4, 3, 2), 40, 100)
     grid, views = mph.Grid.centered((84, 84, 42), 1.0), system.views((pixels, pixels))
     truth = phantom.voxelize(mph.Grid.centered(np.rint(np.array([84, 84, 42]) / spacing), spacing))

@@ -40,7 +40,7 @@ class Problem(NamedTuple):
 
 
 def make(scanner, n, pixels, every):
-    """Noisy counts of a Derenzo phantom around a box of half its activity."""
+    """Return noisy counts of a Derenzo phantom around a box of half its activity."""
     system = scanner[::every]
     grid = mph.Grid.centered(n, 96 / n)
     with pytest.warns(mph.InputWarning):
@@ -61,7 +61,7 @@ def small(scanner):
 
 
 def optimum(problem, penalty, scale, iterations=3000):
-    """By L-BFGS-B, an algorithm and a program that have nothing in common with ours."""
+    """Return the optimum by L-BFGS-B, an algorithm and a program that have nothing in common with ours."""
     optimize = pytest.importorskip("scipy.optimize")
     shape = problem.A.shape_in
 
@@ -138,7 +138,7 @@ def test_a_prior_that_is_too_strong_stays_positive(small):
 
 @pytest.fixture(scope="module")
 def even(scanner):
-    """Exact counts of 10 everywhere in a mask, a ball off the centre, in a grid whose corners no module sees."""
+    """Return exact counts of 10 everywhere in a mask, a ball off centre, in a grid whose corners no module sees."""
     system = scanner[::8]
     grid = mph.Grid.centered((12, 11, 10), (14.0, 14.0, 30.0))
     with pytest.warns(mph.InputWarning):

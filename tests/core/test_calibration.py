@@ -22,7 +22,7 @@ PHYSICS = {"intrinsic_fwhm": 2.0}
 
 
 def points_of(n, seed=1, size=38.0):
-    """A point in the middle and corners of a cube, a little off; the first 4 corners are those of a tetrahedron."""
+    """Return a point in the middle and corners of a cube, a little off; the first 4 corners make a tetrahedron."""
     corners = size * np.array(
         [[0, 0, 0], [1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1], [1, 1, -1], [-1, -1, -1], [1, -1, 1]]
     )
@@ -30,7 +30,7 @@ def points_of(n, seed=1, size=38.0):
 
 
 class Measured:
-    """A scanner off by 1 mm and 0.5 degrees, and what it counts of points."""
+    """Scanner off by 1 mm and 0.5 degrees, and its counts of points."""
 
     def __init__(self, nominal, n=8, counts=20_000, seed=2, **changes):
         rng = np.random.default_rng(seed)
@@ -53,7 +53,7 @@ class Measured:
         return mph.calibrate(self.nominal, images, self.views, model=mph.Emission(self.nominal, **PHYSICS), **options)
 
     def errors(self, found):
-        """(M, 6): what the covariance is of. The true scanner is moved as a whole as the gauge has it."""
+        """Return the errors (M, 6) that the covariance is of, after the true scanner was moved as a whole by the gauge."""
         true, used = self.true, found.used.any(axis=0)
         if found.gauge:
             middle, goal = (system.centers[used].mean(axis=0) for system in (true, self.nominal))
@@ -67,14 +67,14 @@ class Measured:
         return np.concatenate([shifts, found.system.tilt - true.tilt], axis=1)
 
     def normalized(self, found):
-        """The errors' sum of squares per degree of freedom (M,)."""
+        """Return the errors' sum of squares per degree of freedom (M,)."""
         errors = self.errors(found)
         return np.einsum("mi,mij,mj->m", errors, np.linalg.inv(found.covariance), errors) / 6
 
 
 @pytest.fixture
 def some(scanner):
-    """Ten modules of the four rings."""
+    """Return ten modules of the four rings."""
     return scanner[::8]
 
 
@@ -269,7 +269,7 @@ def test_one_line_says_what_is_wrong(some, changes, message):
 
 @pytest.fixture
 def recipe(workbook, scanner, tmp_path):
-    """A recipe of five runs, and what is true."""
+    """Write a recipe of five runs; return its path and the measurement."""
     some = scanner[::8]
     measured = Measured(some, n=5)
     model = mph.Recipe({"model.kind": "emission", "model.intrinsic_fwhm": 2.0})

@@ -25,8 +25,10 @@ N = 160
 
 
 class Rays:
-    """Rays (3, N) that end on a module's crystal, in its frame (u, v, depth behind the pinhole), and where they cross
-    the pinhole's plane."""
+    """Rays (3, N) that end on a module's crystal, in its frame (u, v, depth behind the pinhole).
+
+    `crossing`: their points in the pinhole's plane.
+    """
 
     def __init__(self, source: np.ndarray, target: np.ndarray) -> None:
         self.source, self.target = source, target
@@ -41,7 +43,7 @@ class Rays:
 
 
 def from_roi(rng, system, m: int, crossing: np.ndarray) -> Rays:
-    """From points of the ROI, most of them on its surface and many on the rim that the pinhole sees, through `crossing`."""
+    """Return rays through `crossing` from the ROI, most from its surface and many from the rim that the pinhole sees."""
     b, radius, l = system.pinhole_distance[m], system.roi_radius[m], system.collimator_length[m]
     n = crossing.shape[1]
     direction = rng.normal(size=(3, n))
@@ -56,14 +58,14 @@ def from_roi(rng, system, m: int, crossing: np.ndarray) -> Rays:
 
 
 def disc(rng, n: int, low: float, high: float) -> np.ndarray:
-    """Points (2, n) evenly distributed over a ring: one in each of n rings of equal area."""
+    """Return points (2, n) evenly distributed over a ring: one in each of n rings of equal area."""
     share = rng.permutation((np.arange(n) + rng.random(n)) / n)
     radius, turn = np.sqrt(low**2 + share * (high**2 - low**2)), rng.uniform(0, 2 * np.pi, n)
     return radius * np.stack([np.cos(turn), np.sin(turn)])
 
 
 def rays_of(rng, system, m: int) -> tuple[Rays, Rays]:
-    """Rays from the ROI through the hole; and rays from the ROI and elsewhere that reach the crystal beside the hole."""
+    """Return rays from the ROI through the hole, and rays from the ROI and elsewhere that pass beside the hole."""
     d, l, side = system.pinhole_diameter[m], system.collimator_length[m], system.detector_side[m]
     through = from_roi(rng, system, m, disc(rng, N, 0, 0.9999 * d / 2))
     assert through.on_crystal.max() < side / 2 + 1e-6, "the design formula: all of them meet the crystal"
@@ -79,7 +81,7 @@ def rays_of(rng, system, m: int) -> tuple[Rays, Rays]:
 
 
 def cut_by_triangles(rays: Rays, corners: np.ndarray) -> np.ndarray:
-    """Whether rays meet any of the triangles (F, 3, 3): Moeller and Trumbore 1997, with the rays' moments."""
+    """Return whether rays meet any of the triangles (F, 3, 3): Moeller and Trumbore 1997, with the rays' moments."""
     origin, along = rays.source.T, (rays.target - rays.source).T
     moment = np.cross(origin, along)
     a, e1, e2 = corners[:, 0], corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
@@ -93,7 +95,7 @@ def cut_by_triangles(rays: Rays, corners: np.ndarray) -> np.ndarray:
 
 
 def world_to_module(system, m: int, points: np.ndarray) -> np.ndarray:
-    """Points (..., 3) of the world as u, v, depth."""
+    """Return points (..., 3) of the world as u, v, depth."""
     u, v, k = system.frames()[m]
     return (points - system.centers[m]) @ np.stack([u, v, -k]).T
 
@@ -121,14 +123,14 @@ def test_every_roi_ray_passes_the_mesh_and_the_stl_file_through_the_hole_alone(s
 
 
 class Convex:
-    """A frustum around z, square or round: half-widths at -z and +z, height; `center` in its mother."""
+    """Frustum around z, square or round: half-widths at -z and +z, height; `center` in its mother."""
 
     def __init__(self, round_: bool, behind: float, before: float, height: float, center) -> None:
         self.round, self.behind, self.before, self.height = round_, behind, before, height
         self.center = np.asarray(center, float)[:, None]
 
     def interval(self, source: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Where rays (3, N) are inside: from one fraction of their length to another, or from infinity to minus infinity."""
+        """Return the fractions of rays' lengths between which rays (3, N) are inside; infinity, minus infinity: nowhere."""
         origin, along = source - self.center, target - source
         growth = (self.before - self.behind) / self.height
         middle = (self.before + self.behind) / 2
@@ -167,7 +169,7 @@ class Convex:
 
 
 def path_in_material(solid: Convex, air: list[Convex], rays: Rays) -> np.ndarray:
-    """mm of each ray inside `solid` and outside all of the `air`, whose pieces do not overlap."""
+    """Return the length, mm, of each ray inside `solid` and outside all of the `air`, whose pieces do not overlap."""
     source, target = rays.source * [[1], [1], [-1]], rays.target * [[1], [1], [-1]]  # to the front: z = k
     low, high = solid.interval(source, target)
     low, high = np.maximum(low, 0), np.minimum(high, 1)

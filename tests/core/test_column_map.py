@@ -18,8 +18,8 @@ from mphdrr.core.errors import InputError
 
 from .nasty.case import read
 from .test_workbook import _typed as typed
-from .test_workbook import assert_plain, plain, saved
-from .workbooks import DIMENSIONS, by_design
+from .test_workbook import assert_plain, saved
+from .workbooks import DIMENSIONS, by_design, plain
 
 pytestmark = pytest.mark.filterwarnings("error")
 
@@ -51,7 +51,7 @@ Td = { column = "E", unit = "mm" }
 
 
 def silent(folder: Path, edit: Callable | None = None) -> Path:
-    """The plain workbook with typed numbers and headings that the reader does not understand, edited further."""
+    """Return the plain workbook with typed numbers and headings that the reader does not understand, edited further."""
     book = plain()
     typed(book["Main"], book["Coordinates"])
     for sheet in book.worksheets:

@@ -21,7 +21,7 @@ from .conftest import WORKBOOK, refused, run_python
 def parsers(
     parser: argparse.ArgumentParser, words: tuple[str, ...] = ()
 ) -> Iterator[tuple[tuple[str, ...], argparse.ArgumentParser]]:
-    """All commands, with the words that are typed for them."""
+    """Yield all commands, with the words that are typed for them."""
     yield words, parser
     for action in parser._actions:
         if isinstance(action, argparse._SubParsersAction):
@@ -110,7 +110,7 @@ WRITING = [
 
 @pytest.fixture
 def typed(event_set, tmp_path, monkeypatch):
-    """Gives a command's words with this name for `NAME`, in an empty folder."""
+    """Return a function that types a command with this name for `NAME`, in an empty folder."""
     beside = tmp_path / "beside"
     assert main(["phantom", "derenzo", "--voxels", "4", "-o", str(beside / "volume.nii.gz")]) == 0
     words = f"--phantom derenzo --voxels 4 --size 2 2 --modules 1 -o {beside / 'run.h5'}".split()

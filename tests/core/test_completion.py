@@ -24,7 +24,7 @@ LINES = {
 
 
 def offered(lines: Iterable[str], folder: Path, code: str = "") -> list[list[str]]:
-    """What is offered for each line that is typed so far; each time Python would end."""
+    """Return the completions of each line that is typed so far; each time Python would end."""
     code = f"""
 import os, sys
 {code}

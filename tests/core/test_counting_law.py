@@ -21,14 +21,14 @@ REAL = {
 
 
 def views_of_a_voxel(system):
-    """Fine pixels around the shadow of the voxel at `CENTER` in the first of the modules."""
+    """Return fine pixels around the shadow of the voxel at `CENTER` in the first of the modules."""
     to_point = system.frames()[0] @ (CENTER - system.centers[0])
     middle = to_point[:2] / to_point[2] * system.collimator_length[0]
     return system[:1].views((PIXELS, PIXELS), "virtual", 1.0, pitch=PITCH, offset=middle)
 
 
 def mean_in_voxel(values_at):
-    """The mean of a function of points (P, 3) over the voxel, by Gauss and Legendre."""
+    """Return the mean of a function of points (P, 3) over the voxel, by Gauss and Legendre."""
     nodes, weights = np.polynomial.legendre.leggauss(5)
     places = np.stack(np.meshgrid(nodes, nodes, nodes), axis=-1).reshape(-1, 3) * SIDE / 2 + CENTER
     return np.einsum("a,b,c->abc", weights, weights, weights).reshape(-1) / 8 @ values_at(places)

@@ -22,7 +22,7 @@ BOTH = {"time": TIMES, "start": STARTS}
 
 
 def decays(isotope: mph.Isotope) -> np.ndarray:
-    """The integral of the activity over each frame, by that at the reference time."""
+    """Return the integral of the activity over each frame, by that at the reference time."""
     rate = np.log(2) / isotope.half_life
     return np.exp(-rate * STARTS) * (1 - np.exp(-rate * TIMES)) / rate
 
@@ -90,7 +90,7 @@ def test_recipes_and_runs_have_them(system, workbook, tmp_path, command):
 
 
 def write_phases(frames, path, times, delays, **changes):
-    """A dynamic study: a phase a frame, each with its duration and the delay before it, s."""
+    """Write a dynamic study: a phase a frame, each with its duration and the delay before it, s."""
     from pydicom.dataset import Dataset
 
     parts = []

@@ -21,7 +21,7 @@ def counted(rng, shape=(12, 6, 6), mean=9.0) -> np.ndarray:
 
 
 def both_ways(system, path, frames, orientation, time, **more) -> list[str]:
-    """The warnings of `read_counts` and `counts_run`, after those of the recipe were seen to be the same."""
+    """Return the warnings of `read_counts` and `counts_run`, after a check that those of the recipe are the same."""
     recipe = mph.Recipe(
         {
             "counts.files": list(map(str, path if isinstance(path, list) else [path])), "counts.frames": frames,

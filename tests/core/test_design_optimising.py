@@ -33,7 +33,7 @@ pytest.importorskip("scipy", reason="SciPy is not installed")
 
 
 def along(term, free, values, direction, step=1e-3) -> tuple[float, float]:
-    """The derivative of a term along free numbers, and that by differences of the fourth order."""
+    """Return the derivative of a term along free numbers, and that by differences of the fourth order."""
     _, by_rows = term(free.build(values))
     exact = np.einsum("mr,mrk,k->", by_rows, free.jacobian(values), direction)
     at = {n: term(free.build(values + n * step * direction))[0] for n in (-2, -1, 1, 2)}
@@ -41,7 +41,7 @@ def along(term, free, values, direction, step=1e-3) -> tuple[float, float]:
 
 
 def workbook_like(system: PinholeSystem):
-    """Places, tilts, holes and lengths of all modules."""
+    """Return a free parametrisation of places, tilts, holes and lengths of all modules."""
     limits = {"radial": [-20, 20], "along": [-20, 20], "z": [-20, 20], "tilt": [-9, 9]}
     return free_parameters(
         "workbook", displacement_parameters(system), {**limits, "diameter": [0.5, 2], "longer": [0.5, 2]}
@@ -53,7 +53,7 @@ def model(system: PinholeSystem) -> mph.Emission:
 
 
 def crowd(system: PinholeSystem) -> PinholeSystem:
-    """The modules closer together, so that they overlap and stand in each other's way, with smaller fields of view."""
+    """Return the modules so close together that they overlap and block each other, with smaller fields of view."""
     farther = np.where(np.arange(len(system)) < 6, 0.6, 0.9)[:, None]
     return replace(
         system, centers=farther * [1, 1, 0.3] * system.centers, collimator_length=1.3 * system.collimator_length
@@ -101,7 +101,7 @@ def one_module(b=200.0, l=50.0, d=3.0) -> PinholeSystem:
 
 
 def best_hole(objective, b=200.0, l=50.0) -> float:
-    """The hole that the search finds."""
+    """Return the diameter, mm, that the search finds."""
     free = free_parameters("workbook", displacement_parameters(one_module(b, l)), {"diameter": [0.1, 5.0]})
     loss = DesignLoss(free, [(-1.0 / abs(objective(one_module(b, l))[0]), objective)])
     from scipy.optimize import minimize

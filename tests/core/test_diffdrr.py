@@ -30,7 +30,7 @@ TRANSLATION = torch.tensor([[4.0, 120.0, -7.0], [-9.0, 150.0, 5.0]])
 
 @pytest.fixture
 def theirs():
-    """DiffDRR's modules and TorchIO."""
+    """Return DiffDRR's modules and TorchIO."""
     names = ("diffdrr.drr", "diffdrr.pose", "diffdrr.data", "torchio")
     reason = "DiffDRR is not installed ({} is missing)"
     modules = (pytest.importorskip(name, reason=reason.format(name), exc_type=ImportError) for name in names)
@@ -38,7 +38,7 @@ def theirs():
 
 
 def ct(rng, shape=(24, 20, 22)):
-    """CT numbers: air around an uneven body."""
+    """Return CT numbers: air around an uneven body."""
     hu = np.full(shape, -1000.0, np.float32)
     hu[4:-4, 3:-3, 4:-4] = rng.uniform(-200, 900, tuple(np.array(shape) - [8, 6, 8]))
     return hu
@@ -397,7 +397,7 @@ def test_a_view_is_a_pose(detector, system, subject):
 
 
 def angles_of(system, m):
-    """Azimuth and elevation of module m, as in columns V and W of the workbook."""
+    """Return azimuth and elevation of module m, as in columns V and W of the workbook."""
     x, y, z = system.centers[m]
     return float(np.arctan2(y, x)), float(np.arctan2(z, np.hypot(x, y)))
 

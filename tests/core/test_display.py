@@ -77,7 +77,7 @@ def test_every_image_stands_in_its_rings_row_as_the_pinhole_sees_it(shape, facto
 
 
 def has_ink(picture, text, size):
-    """Whether a text stands somewhere in a picture, in white on something dark."""
+    """Return whether a text stands somewhere in a picture, in white on something dark."""
     ink, _ = text_ink(text, size)
     windows = np.lib.stride_tricks.sliding_window_view(picture.min(axis=2), ink.shape)
     return bool(((windows[..., ink > 0.9] > 220).all(axis=-1) & (windows[..., ink < 0.2] < 160).all(axis=-1)).any())

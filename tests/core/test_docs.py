@@ -193,7 +193,7 @@ NOT_RUN = {
 
 
 def blocks(page: Path) -> Iterator[tuple[str, str, str, int]]:
-    """Each block with a language: why it is not run, the language, its text, its line."""
+    """Yield each block with a language: why it is not run, the language, its text, its line."""
     text = page.read_text(encoding="utf-8")
     for found in re.finditer(r"^(?:<!-- not run: ([^\n]*) -->\n)?```(\w+)\n(.*?)^```$", text, re.MULTILINE | re.DOTALL):
         yield found[1] or "", found[2], found[3], text[: found.start(3)].count("\n")

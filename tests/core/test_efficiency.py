@@ -21,7 +21,7 @@ def few(system):
 
 @pytest.fixture
 def forms(few, rng):
-    """One number, one for each of five modules, and images of 4 x 6 pixels, some of them dead."""
+    """Return one number, one for each of five modules, and images of 4 x 6 pixels, some of them dead."""
     images = rng.uniform(0.2, 1.8, (len(few), 4, 6))
     images[:, 1, 2] = 0
     images[3] = 0
@@ -105,7 +105,7 @@ def test_the_geometrys_gradient_and_closed_forms_are_weighted(few, forms, rng):
 
 @pytest.fixture
 def scan(system, rng):
-    """Grid, views and a volume that all modules see."""
+    """Return grid, views and a volume that all modules see."""
     grid = mph.Grid.centered(6, 12.0)
     return grid, system.views((8, 8), "real"), rng.uniform(10, 50, grid.shape).astype(np.float32)
 
@@ -251,7 +251,7 @@ def test_events_have_it(tmp_path):
 
 
 def flood(rng, mean=1000.0, modules=4, n=40, spread=0.04):
-    """Counts of an even source near a corner, beyond a crystal that sees less at its edges, and the pixels' efficiencies."""
+    """Return counts of an even source near a corner, on a crystal that sees less at its edges, and the efficiencies."""
     v, u = np.meshgrid(*[np.linspace(-1, 1, n)] * 2, indexing="ij")
     own = np.clip(rng.normal(1, spread, (modules, n, n)), 0.5, 1.5)
     return mean * (1 + 0.15 * u - 0.1 * v) * (1 - 0.2 * (u**2 + v**2)) * own, own

@@ -34,7 +34,7 @@ every_grid = pytest.mark.parametrize(
 
 
 def on_grids(things) -> pytest.MarkDecorator:
-    """Each thing on each grid; only one grid for each is not `long`."""
+    """Return the cases of each thing on each grid; only one grid for each is not `long`."""
     return pytest.mark.parametrize(
         ("thing", "grid"),
         [
@@ -50,7 +50,7 @@ def name(thing: mph.Phantom | mph.Shape) -> str:
 
 
 def covering(axes: np.ndarray, sides, n_voxels: int, radius: float, center=(0.0, 0.0, 0.0)) -> mph.Grid:
-    """About `n_voxels` voxels with edges along the columns of `axes` that contain a ball; `sides` are their proportions."""
+    """Return about `n_voxels` voxels along the columns of `axes`, of proportions `sides`, that contain a ball."""
     reach = 2.002 * radius * np.linalg.norm(np.linalg.inv(axes), axis=1)
     sides, one = np.array(sides, float), np.array(sides) == 0
     sides[~one] *= (np.prod(reach[~one] / sides[~one]) / n_voxels) ** (1 / np.sum(~one))
@@ -69,12 +69,12 @@ def without_warning(phantom: mph.Phantom, grid: mph.Grid, pose=None, quantity: s
 
 
 def plane_points(n: int) -> np.ndarray:
-    """Points (n, 2) that fill the unit square evenly: M. Roberts' R2 sequence."""
+    """Return points (n, 2) that fill the unit square evenly: M. Roberts' R2 sequence."""
     return (0.5 + np.arange(1, n + 1)[:, None] * [0.7548776662466927, 0.5698402909980532]) % 1
 
 
 def exact_means(phantom: mph.Phantom, grid: mph.Grid, low: np.ndarray, size, pose=None, n: int = 4000) -> np.ndarray:
-    """Means of a phantom over boxes of `size` voxels from the indices `low` (m, 3), of `n` exact line integrals each."""
+    """Return a phantom's means over boxes of `size` voxels from indices `low` (m, 3), of `n` exact line integrals each."""
     axis = int(np.argmax(grid.spacing * size))
     others = [i for i in range(3) if i != axis]
     starts = np.repeat(low[:, None] - 0.5, n, axis=1)

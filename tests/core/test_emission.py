@@ -13,13 +13,13 @@ TOLERANCE = {"numpy": 1e-12, "torch": 1e-5, "cpu": 1e-5}
 
 
 def one_module(**changes):
-    """A pinhole at x = 200 mm that looks along -x."""
+    """Return a pinhole at x = 200 mm that looks along -x."""
     lengths = {"pinhole_diameter": 2.0, "collimator_length": 60.0, "detector_side": 50.0, "detector_thickness": 10.0}
     return mph.PinholeSystem(centers=[[200.0, 0.0, 0.0]], roi_radius=60.0, **(lengths | changes))
 
 
 def sensitivity(system, points):
-    """The law of a point source, (M, N): counts per decay at each of the points (N, 3)."""
+    """Return the law of a point source, (M, N): counts per decay at each of the points (N, 3)."""
     towards = points[None] - system.centers[:, None]
     distance = np.linalg.norm(towards, axis=2)
     h = np.einsum("mni,mi->mn", towards, system.principal_rays)
@@ -32,7 +32,7 @@ def in_ball(rng, radius, n):
 
 
 def turned_grid(shape, spacing, center=(0.0, 0.0, 0.0)):
-    """A grid without planes parallel to any module's rays."""
+    """Return a grid without planes parallel to any module's rays."""
     affine = mph.euler_pose(0.3, 0.5, 0.2)
     affine[:3, :3] *= spacing
     affine[:3, 3] = center - affine[:3, :3] @ ((np.array(shape) - 1) / 2)
@@ -47,7 +47,7 @@ def assert_adjoint(A, rng):
 
 
 def assert_real_is_virtual(model, rng, pitch=4.0, magnification=3.0, offset=(0.0, 0.0)):
-    """Images on the crystal are those of virtual detectors, point-inverted."""
+    """Check that images on the crystal are those of virtual detectors, point-inverted."""
     grid = general_grid(rng, (9, 8, 7))
     x, offset = rng.random(grid.shape), np.array(offset)
     views = (
@@ -137,14 +137,14 @@ def test_views_of_another_system_and_what_is_no_mu_are_refused(system):
 
 
 def some_mu(rng, grid):
-    """Between air and more than bone, with empty margins."""
+    """Return mu between air and more than bone, with empty margins."""
     array = rng.uniform(0, 0.05, grid.shape)
     array[0] = array[:, -1] = 0
     return mph.Volume(array, grid, "mu")
 
 
 def mu_grids(grid, rng):
-    """The activity's grid; one coarser, turned and larger; one that begins behind the pinhole; one elsewhere."""
+    """Return the activity's grid; one coarser, turned and larger; one that begins behind the pinhole; one elsewhere."""
     around = mph.Grid.centered((7, 8, 9), (90.0, 80.0, 70.0), (20.0, 10.0, -5.0))
     return [grid, turned_grid((6, 5, 7), 25.0, (4.0, 3.0, 1.0)), around, mph.Grid.centered((3, 3, 3), 5.0, (0, 0, 900))]
 
@@ -229,7 +229,7 @@ def test_attenuation_equals_a_fine_sum_along_the_ray(backend, which, rng):
 @pytest.mark.parametrize("backend", BACKENDS)
 @pytest.mark.parametrize("mu", [1e-6, 0.0154, 0.3, 8.0])
 def test_uniform_body_counts_in_closed_form(backend, mu):
-    """f (1 - exp(-mu L)) / mu along each chord L, whatever the voxels."""
+    """Each chord L counts f (1 - exp(-mu L)) / mu, whatever the voxels."""
     system = one_module()
     for grid in (turned_grid((9, 8, 7), 10.0), turned_grid((3, 2, 1), (30.0, 40.0, 70.0))):
         views = system.views((12, 13))
@@ -244,7 +244,7 @@ def test_uniform_body_counts_in_closed_form(backend, mu):
 
 
 def spot_image(model, place, pitch=0.05, n=160):
-    """Image of a spot of 1 mm around the centre of its projection, and the pixels' positions on the crystal along u."""
+    """Return a spot's image, of 1 mm, around the centre of its projection, and the pixels' positions on the crystal in u."""
     system = model.system
     column, row, factor = system.views((1, 1), "real").projection_matrices()[0] @ [*place, 1.0]
     offset = np.array([column, row]) / factor * system.detector_side[0]
@@ -255,7 +255,7 @@ def spot_image(model, place, pitch=0.05, n=160):
 
 
 def width(image, places):
-    """Standard deviation along u."""
+    """Return the standard deviation along u."""
     profile = image.sum(axis=0) / image.sum()
     return np.sqrt(profile @ places**2 - (profile @ places) ** 2)
 

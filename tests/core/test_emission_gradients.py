@@ -18,7 +18,7 @@ from .test_emission import mu_grids, some_mu  # noqa: E402
 
 
 def grid_of_mu(which, grid, rng):
-    """The activity's grid, or one that is larger, coarser and rotated."""
+    """Return the activity's grid, or one that is larger, coarser and rotated."""
     return mu_grids(grid, rng)[("shared", "own").index(which)]
 
 

@@ -114,12 +114,12 @@ def recipe_of(path, **changes):
 
 @pytest.fixture
 def frames(rng):
-    """Frames of the lower, the peak's and the upper window."""
+    """Return frames of the lower, the peak's and the upper window."""
     return np.concatenate([rng.poisson(mean, (12, 6, 6)) for mean in (6.0, 90.0, 3.0)]).astype(np.uint16)
 
 
 def scatter_of(frames, **more):
-    """The estimate of frames in the order of their windows, as the run's images lie on the crystals ("back-v")."""
+    """Return the estimate of frames in the order of their windows, as a run's images lie on the crystals ("back-v")."""
     lower, peak, upper = frames.reshape(3, 12, 6, 6).astype(float)
     return mph.energy_window_scatter(lower, peak, upper, WIDTHS, **more)[0]
 

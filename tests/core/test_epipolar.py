@@ -24,7 +24,7 @@ def homogeneous(pixels):
 
 
 def distances_from_lines(matrices, first, second):
-    """Of pixels (P, N, 2) of the second views, in px, from the epipolar lines of pixels (P, N, 2) of the first ones."""
+    """Return distances, px, of pixels (P, N, 2) of second views from the epipolar lines of those of the first views."""
     lines = np.einsum("pij,pkj->pki", matrices, homogeneous(first))
     return np.einsum("pki,pki->pk", lines, homogeneous(second)) / np.hypot(lines[..., 0], lines[..., 1])
 

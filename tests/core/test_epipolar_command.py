@@ -25,7 +25,7 @@ def run(workbook, capsys):
 
 @pytest.fixture
 def pixels(scanner):
-    """The point's pixels in all modules."""
+    """Return the point's pixels in all modules."""
     return mph.project_points(scanner.views(), [POINT])[:, 0]
 
 

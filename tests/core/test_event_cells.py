@@ -35,7 +35,7 @@ FILES = ["=1+2.nii.gz", "+1,2.nii.gz", "@SUM(A1).nii.gz", "'-quoted.nii.gz", "pl
 
 @pytest.fixture
 def hostile(tmp_path: Path) -> events.EventSet:
-    """A set whose phantoms and files have names that are formulas."""
+    """Make a set whose phantoms and files have names that are formulas."""
     volume = mph.Volume(np.ones((4, 4, 4)), mph.Grid.centered((4, 4, 4), 9.0))
     for file in FILES:
         mph.write_volume(volume, tmp_path / file)

@@ -28,7 +28,7 @@ def made(tmp_path_factory) -> Path:
 
 @pytest.fixture
 def folder(made, tmp_path) -> Path:
-    """A copy of the set, to damage."""
+    """Return a copy of the set, to damage."""
     return Path(shutil.copytree(made / "set", tmp_path / "set"))
 
 

@@ -146,7 +146,7 @@ def test_3dunet_says_what_does_not_fit(event_set, tmp_path):
 
 
 def read_shards(folder: Path) -> dict[str, dict[str, object]]:
-    """As WebDataset's format says: members that are equal up to the first dot are one sample, and follow each other."""
+    """Return WebDataset's samples: members that are equal up to the first dot, which follow each other."""
     samples: dict[str, dict[str, object]] = {}
     for path in sorted(folder.glob("*.tar")):
         before = None

@@ -17,7 +17,7 @@ EXAMPLES = Path(__file__).parents[2] / "examples"
 
 @pytest.fixture(scope="module")
 def unet3d():
-    """The loaders of pytorch-3dunet."""
+    """Return the loaders of pytorch-3dunet."""
     if importlib.util.find_spec("pytorch3dunet") is None:
         pytest.skip("no pytorch-3dunet")
     import pytorch3dunet.datasets.utils
@@ -31,7 +31,7 @@ def wds():
 
 
 def phase(folder, patch) -> dict:
-    """One of the phases of pytorch-3dunet's configuration, with nothing but conversion to tensors."""
+    """Return a phase of pytorch-3dunet's configuration, with nothing but conversion to tensors."""
     to_tensor = [{"name": "ToTensor", "expand_dims": True}]
     slices = {"name": "SliceBuilder", "patch_shape": patch, "stride_shape": patch, "skip_shape_check": True}
     return {"file_paths": [str(folder)], "slice_builder": slices, "transformer": {"raw": to_tensor, "label": to_tensor}}

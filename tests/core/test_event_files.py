@@ -30,7 +30,7 @@ def small(tmp_path_factory) -> events.EventSet:
 
 
 def stored(event: events.Event) -> dict[str, np.ndarray]:
-    """All datasets of a file by name, read by h5py alone, with their scales."""
+    """Return all datasets of a file by name, read by h5py alone, with their scales."""
     found = {}
 
     def keep(name: str, item: h5py.Dataset | h5py.Group) -> None:

@@ -299,7 +299,7 @@ def edited(path: Path, edit) -> None:
 
 
 def sealed_again(path: Path, edit) -> None:
-    """As a program would write it that knows the format: the seal is right, what it says is not the recipe's."""
+    """Seal a changed event as a program would that knows the format: only its content is not the recipe's."""
     with h5py.File(path, "r") as old:
         seal = hdf5.parse_seal(path.read_bytes()[: hdf5.HEADER])
 

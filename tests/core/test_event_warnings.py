@@ -63,7 +63,7 @@ CASES = {
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory) -> Path:
-    """The volumes that the settings name."""
+    """Write the volumes that the settings name."""
     folder = tmp_path_factory.mktemp("volumes")
     shape = GRID.shape
     for name, quantity, low, high in (
@@ -81,7 +81,7 @@ def folder(tmp_path_factory) -> Path:
 
 
 def event_text(given: dict[str, Any]) -> str:
-    """The recipe of events with the settings of a run: its first phantom is the run's."""
+    """Return the recipe of events with the settings of a run: its first phantom is the run's."""
     names = ("system", "detector", "truth", "phantoms", "pose", "model")
     tables: dict[str, dict[str, Any]] = {name: {} for name in names}
     is_mu = "model.photons" in given

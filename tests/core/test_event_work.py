@@ -27,7 +27,7 @@ COUNT = 6
 
 
 def tree(folder: Path) -> dict[str, bytes]:
-    """All files of a folder, hidden ones, too."""
+    """Return all files of a folder, hidden ones, too."""
     return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
@@ -39,7 +39,7 @@ def undisturbed(tmp_path_factory) -> dict[str, bytes]:
 
 
 def begin(folder: Path, *options: str, **how: Any) -> subprocess.Popen[str]:
-    """The command, begun."""
+    """Begin the command."""
     command = [sys.executable, "-m", "mphdrr", "events", "make", str(folder / "set")]
     command += ["--recipe", str(folder / "small.toml"), "-n", str(COUNT), *options]
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=folder, **how)
@@ -190,7 +190,7 @@ def seconds_of(process: psutil.Process) -> float:
 
 
 def children_seconds() -> float:
-    """Of processes that have ended, and of theirs."""
+    """Return the processor time, s, of this process's children that have ended, and of theirs."""
     return sum(os.times()[2:4])
 
 
@@ -214,7 +214,7 @@ def test_what_a_worker_refuses_is_one_line(tmp_path, command):
 
 @pytest.fixture
 def small_disk(tmp_path):
-    """A disk of 400 KiB; where there may be none, skip."""
+    """Yield a disk of 400 KiB; where there may be none, skip."""
     disk = tmp_path / "disk"
     disk.mkdir()
     mounted = sys.platform == "linux" and os.geteuid() == 0

@@ -78,7 +78,7 @@ def test_a_setting_that_is_added_changes_no_other(tmp_path):
 
 
 def reference(recipe: events.EventRecipe) -> list[dict[str, Any]]:
-    """Some numbers of six events: as drawn, and sums of their arrays."""
+    """Return some numbers of six events: as drawn, and sums of their arrays."""
     maker, found = events.EventMaker(recipe), []
     for number in range(6):
         event = maker.make(number)
@@ -422,7 +422,7 @@ WRONG: list[Any] = [
 
 
 def places(value: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
-    """Where values are in a recipe."""
+    """Yield the places of values in a recipe."""
     items = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
     for key, inner in items:
         yield (*path, key)

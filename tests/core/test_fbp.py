@@ -21,7 +21,7 @@ def views_of(angles, columns=64, pitch=1.0, rows=3, **options):
 
 
 def disc(n, radius, center=(0.0, 0.0)):
-    """A disc of 1 on a grid of n x n x 3 voxels of a side of 64 mm, averaged over 4 x 4 points a voxel."""
+    """Return a disc of 1 on a grid of n x n x 4 voxels of a side of 64 mm, averaged over 4 x 4 points a voxel."""
     grid = mph.Grid.centered((n, n, 4), (SIDE / n, SIDE / n, 1.5))
     points = (np.arange(4 * n) + 0.5) * SIDE / (4 * n) - SIDE / 2
     inside = (points[:, None] - center[0]) ** 2 + (points - center[1]) ** 2 < radius**2

@@ -26,7 +26,7 @@ def projector(system, n=12, spacing=8.0, **model):
 
 
 def integrals(activities, starts, times):
-    """Decays of activities that are those of the reference time, between `starts` and `starts` + `times`."""
+    """Return decays between `starts` and `starts` + `times` of activities that are those of the reference time."""
     return activities * (np.exp(-RATE * starts) - np.exp(-RATE * (starts + times))) / RATE
 
 

@@ -27,7 +27,7 @@ SIZE = 64 << 10
 
 @pytest.fixture(autouse=True)
 def collected() -> Iterator[None]:
-    """Here, and not in another test; files of libraries that are still open keep their room on the disk, too."""
+    """Collect garbage here, not in another test; libraries' files that are still open keep their room on the disk."""
     yield
     gc.collect()
     gc.freeze()  # what is left is not looked at again
@@ -78,7 +78,7 @@ NAMES = [pytest.param(name, marks=needs_torch) if name == "run.pt" else name for
 
 
 def refused_and_nothing_left(write: Callable[[Path], object], path: Path) -> None:
-    """Where there is no file yet, and where there is one."""
+    """Check a refusal that leaves nothing, where there is no file yet, and where there is one."""
     refused(lambda: write(path), str(path), "cannot be written")
     assert list(path.parent.iterdir()) == []
     if path.suffix:
@@ -90,7 +90,7 @@ def refused_and_nothing_left(write: Callable[[Path], object], path: Path) -> Non
 
 @pytest.fixture(scope="module")
 def full_disk(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    """A folder on a disk of `SIZE` bytes."""
+    """Yield a folder on a disk of `SIZE` bytes."""
     folder = tmp_path_factory.mktemp("disk")
     command = ["mount", "-t", "tmpfs", "-o", f"size={SIZE}", "none", str(folder)]
     with contextlib.suppress(OSError):

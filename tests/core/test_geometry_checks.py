@@ -21,7 +21,7 @@ def system_of(centers, d=2.0, length=60.0, side=50.0, thickness=10.0, radius=40.
 
 
 def crowd(rng, n: int = 30) -> mph.PinholeSystem:
-    """Modules of all sizes, so close together that many overlap."""
+    """Return modules of all sizes, so close together that many overlap."""
     direction = rng.normal(size=(n, 3)) * [0.2, 0.5, 0.3] + [1, 0, 0]
     direction /= np.linalg.norm(direction, axis=1)[:, None]
     return system_of(

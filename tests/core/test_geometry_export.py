@@ -30,7 +30,7 @@ def divide(seen):
 
 
 def project(views, points):
-    """Points (M, N, 3) to (M, N, 2): column and row."""
+    """Project points (M, N, 3) to (M, N, 2): column and row."""
     return divide(np.einsum("mij,mnj->mni", views.projection_matrices(), homogeneous(points)))
 
 
@@ -62,7 +62,7 @@ def rotation(i, j, degrees):
 
 
 def read_rtk(path, points):
-    """RTK's page "3D projection geometry": the matrix from the nine parameters, which must be that of the file."""
+    """Follow RTK's page "3D projection geometry": the matrix from the nine parameters must be that of the file."""
     text = path.read_text()
     spacing, origin = detector_of(text)
     root = ET.fromstring(text)
@@ -103,7 +103,7 @@ def read_kornia(path, points):
 
 
 def read_pytorch3d(path, points):
-    """PyTorch3D's page "Cameras": row vectors, +X left, +Y up; screen from NDC by its own formulas."""
+    """Follow PyTorch3D's page "Cameras": row vectors, +X left, +Y up; screen from NDC by its own formulas."""
     a = arrays(path)
     view = points @ a["R"] + a["T"][:, None]
     assert np.allclose(np.linalg.det(a["R"]), 1)
@@ -117,7 +117,7 @@ def read_pytorch3d(path, points):
 
 
 def read_nerf(path, points):
-    """nerfstudio's page "Data conventions": +X right, +Y up, -Z forward; for pictures turned by `as_seen`."""
+    """Follow nerfstudio's page "Data conventions": +X right, +Y up, -Z forward; for pictures turned by `as_seen`."""
     document = json.loads(path.read_text())
     pixels = []
     for frame, own_points in zip(document["frames"], points, strict=True):
@@ -133,7 +133,7 @@ def read_nerf(path, points):
 
 
 def read_leap(path, points):
-    """LEAP's set_modularbeam: s(x) and t(x) of its documentation, along colVectors and rowVectors."""
+    """Follow LEAP's set_modularbeam: s(x) and t(x) of its documentation, along colVectors and rowVectors."""
     a = arrays(path)
     y, c, v, u = (a[n].astype(float)[:, None] for n in ("sourcePositions", "moduleCenters", "rowVectors", "colVectors"))
     n = np.cross(u, v)
@@ -165,7 +165,7 @@ def deviation(format, views, points, path, system, **options):
 
 
 def fiducials(views, rng, count=20):
-    """Points (M, count, 3) that the views see: anywhere on rays of pixels, between source and detector."""
+    """Return points (M, count, 3) that the views see: anywhere on rays of pixels, between source and detector."""
     n_v, n_u = views.shape
     a = (rng.uniform(-0.5, n_u - 0.5, (len(views), count, 1)) - (n_u - 1) / 2) * views.u_steps[:, None]
     b = (rng.uniform(-0.5, n_v - 0.5, (len(views), count, 1)) - (n_v - 1) / 2) * views.v_steps[:, None]
@@ -174,7 +174,7 @@ def fiducials(views, rng, count=20):
 
 
 def general_views(rng, mirrored=False, count=15):
-    """Views of any pose, with pixels of one proportion and many sizes, far off centre."""
+    """Return views of any pose, with pixels of one proportion and many sizes, far off centre."""
     poses = np.array([mph.euler_pose(*rng.uniform(-4, 4, 3))[:3, :3] for _ in range(count)])
     poses[0] = mph.euler_pose(0, np.pi / 2, 0)[:3, :3]  # axes along the world's
     poses[1] = [[1, 0, 0], [0, 0, 1], [0, -1, 0]]  # RTK's gantry and in-plane angles are one here

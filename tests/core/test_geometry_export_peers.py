@@ -58,7 +58,7 @@ def test_rtk_reads_the_geometry(views, system, rng, tmp_path):
 
 
 def rtk_images(system, views, grid, array, path):
-    """Images by RTK's Joseph projector, of the geometry that is written to `path`."""
+    """Return images by RTK's Joseph projector, of the geometry that is written to `path`."""
     itk, rtk = imported_rtk()
     mph.write_geometry(system, path, "rtk", views=views)
     spacing, origin = detector_of(path.read_text())

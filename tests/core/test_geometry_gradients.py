@@ -26,7 +26,7 @@ SHAPES = [(12, 9, 10), (7, 5, 6), (1, 6, 4), (5, 1, 3), (4, 5, 1), (1, 1, 1)]
 
 
 def oblique_rays(rng, grid, n=60):
-    """Rays through the grid: from outside, from inside, ending inside, both."""
+    """Return rays through the grid: from outside, from inside, ending inside, both."""
     size = np.ptp(grid.corners(), axis=0).max()
     sources = grid.center + rng.normal(size=(n, 3)) * size * 1.5
     targets = 2 * grid.center - sources + rng.normal(size=(n, 3)) * size * 0.3
@@ -36,7 +36,7 @@ def oblique_rays(rng, grid, n=60):
 
 
 def some_mu(rng, grid, which):
-    """None; on the volume's grid; on another one that cuts across it."""
+    """Return mu by name: none; on the volume's grid; on another one that cuts across it."""
     if which is None:
         return None
     if which == "own":

@@ -52,7 +52,7 @@ def read_glb(path) -> dict:
 
 
 def glb_chunks(path) -> tuple[dict, bytes]:
-    """The JSON and the binary chunk."""
+    """Return the JSON and the binary chunk."""
     data = path.read_bytes()
     magic, version, length = data[:4], *np.frombuffer(data[4:12], "<u4")
     assert (magic, version, length) == (b"glTF", 2, len(data))

@@ -56,7 +56,7 @@ def run(folder: Path, command: str) -> None:
 
 @pytest.fixture(scope="module")
 def inputs(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Files of the names in the examples, small."""
+    """Write small files of the names in the examples."""
     folder = tmp_path_factory.mktemp("examples")
     shutil.copy(WORKBOOK, folder / "scanner.xlsx")
     shutil.copy(THORAX, folder / "thorax.toml")

@@ -25,7 +25,7 @@ def depth_projector(grid, pixels=64, backend="auto", system=SYSTEM, **changes):
 
 
 def disc_up_to(x, y):
-    """Share of the unit disc's area left of x and below y."""
+    """Return the share of the unit disc's area left of x and below y."""
     x, y = np.clip(x, -1, 1), np.clip(y, -1, 1)
 
     def under(t):
@@ -38,7 +38,7 @@ def disc_up_to(x, y):
 
 
 def exact_image(system, pixels, edges, at, work):
-    """The image of a voxel in module 0, all of it on the crystal: the discs of its points, as pixels cut them."""
+    """Return a voxel's image in module 0, all of it on the crystal: the discs of its points, as pixels cut them."""
     (u, v, k), l = system.frames()[0], float(system.collimator_length[0])
     d, pitch = float(system.pinhole_diameter[0]), float(system.detector_side[0]) / pixels
     from_hole = at - system.centers[0]
@@ -70,7 +70,7 @@ def exact_image(system, pixels, edges, at, work):
 
 
 def errors_of_voxels(rng, size, pixels, hole, near=False, voxels=1, depth=80, work=2e6):
-    """Share of counts misplaced, and of the total, of single voxels anywhere in a grid that is seen aslant or straight.
+    """Return errors of single voxels anywhere in a grid, seen aslant or straight: share misplaced, and of the total.
 
     The grid is 50 mm wide, or `depth` voxels. With `near`, it is as close to the pinhole as "depth" takes it.
     """
@@ -333,7 +333,7 @@ def test_what_it_does_not_take_is_refused():
 
 
 def transmitted(mu, edges, at, m, n=40_000):
-    """The mean of exp(-integral of mu) of straight photons from anywhere in a voxel through anywhere in the hole."""
+    """Return the mean exp(-integral of mu) of straight photons from anywhere in a voxel through anywhere in the hole."""
     u, v, _ = SYSTEM.frames()[m]
     sequence = (0.5 + np.arange(n)[:, None] / 1.1673039782614187 ** np.arange(1, 6)) % 1  # R5 of M. Roberts
     points = (sequence[:, :3] - 0.5) @ edges.T + at
@@ -343,7 +343,7 @@ def transmitted(mu, edges, at, m, n=40_000):
 
 
 def worst_share_off(mu, grid, region, rng, n):
-    """The largest relative error of what is left of photons from `n` voxels of a region."""
+    """Return the largest relative error of the transmittance of photons from `n` voxels of a region."""
     views, errors = SYSTEM.views((64, 64)), []
     attenuated, free = (mph.Projector(grid, views, mph.Emission(SYSTEM, each)) for each in (mu, None))
     for index in rng.permutation(np.argwhere(region))[:n]:

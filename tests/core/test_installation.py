@@ -44,7 +44,7 @@ TYPED = "import mphdrr.core as mph\nimages = mph.read_run('run.h5').projections\
 
 
 def run(*command: object, folder: Path) -> str:
-    """What a program prints in a bare surrounding: nothing on the path, and no network where that can be had."""
+    """Return the output of a program in a bare surrounding: nothing on the path, and no network where that can be had."""
     words = [str(word) for word in command]
     alone = [shutil.which("unshare") or "unshare", "--map-root-user", "--net"]
     if shutil.which("unshare") and subprocess.run([*alone, "true"], capture_output=True).returncode == 0:
@@ -72,7 +72,7 @@ def download(folder: Path) -> None:
 
 
 def interpreter(version: str) -> str | None:
-    """A Python of this version, if there is any."""
+    """Return a Python of this version, if there is any."""
     kept = sorted(Path.home().glob(f".pyenv/versions/{version}.*/bin/python"))
     found = str(kept[-1]) if kept else shutil.which(f"python{version}")
     # pyenv's shim of a version that is not chosen is there, but does not run
@@ -121,7 +121,7 @@ def assert_metadata(about: dict, files: list[str], commands: list[str]) -> None:
 
 
 def assert_types_are_seen(python: Path, folder: Path) -> None:
-    """By a type checker, those of the installed package."""
+    """Check that a type checker sees the types of the installed package."""
     if importlib.util.find_spec("mypy") is None:
         return
     (folder / "script.py").write_text(TYPED)

@@ -31,7 +31,7 @@ METHODS = [*METHODS_OF_COUNTS, *(pytest.param(method, id=method.__name__) for me
 
 @pytest.fixture(scope="module")
 def problem(scanner):
-    """Five modules around 10^3 voxels: projector, counts, truth."""
+    """Return five modules around 10^3 voxels: projector, counts, truth."""
     system = scanner[::16]
     grid = mph.Grid.centered(10, 8.0)
     with pytest.warns(mph.InputWarning):

@@ -24,7 +24,7 @@ MIB = 2**20
 
 @pytest.fixture
 def job(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
-    """A folder that stands for /sys/fs/cgroup, with /proc/self beside it; `groups` says where a process is."""
+    """Yield a folder that stands for /sys/fs/cgroup, with /proc/self beside it; `groups` says where a process is."""
     monkeypatch.setattr(memory, "_PROCESS", tmp_path / "proc")
     monkeypatch.setattr(memory, "available", memory.available.__wrapped__)  # type: ignore[attr-defined]
     memory._control_groups.cache_clear()
@@ -156,7 +156,7 @@ JOBS = [
 
 
 def in_group(arguments: list[str], folder: Path, limit: int | None = None) -> tuple[int, str, int]:
-    """Status and errors of a command in a control group of its own, and the most memory that it had at once, in bytes."""
+    """Return status, errors and peak memory, bytes, of a command in a control group of its own."""
     group = GROUPS / f"mphdrr-test-{os.getpid()}"
     group.mkdir()
     try:

@@ -48,7 +48,7 @@ count = 1
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """A folder with a judge's recipe and its sets."""
+    """Make a folder with a judge's recipe and its sets."""
     path = tmp_path_factory.mktemp("judge")
     for name, seed in (("rods", 5), ("validation", 6)):
         text = RODS.replace("seed = 5", f"seed = {seed}").replace("[radon]", BELIEVED.lstrip())
@@ -59,7 +59,7 @@ def folder(tmp_path_factory):
 
 
 def short_recipe(folder, text=SHORT_TEST):
-    """The judge's recipe with other tests."""
+    """Return the judge's recipe with other tests."""
     (folder / "short.toml").write_text(JUDGE + text)
     return read_judge_recipe(folder / "short.toml")
 

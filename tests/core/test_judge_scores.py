@@ -83,7 +83,7 @@ def test_the_truth_has_all_of_the_contrast_of_an_added_rod_and_none_of_one_left_
 
 
 def scores_of_pairs(altered, factor):
-    """The scores of volumes that show a share `factor` of every rod, also of one that is left out."""
+    """Return the scores of volumes that show a share `factor` of every rod, also of one that is left out."""
     phantom = mph.DerenzoPhantom(36.0, DIAMETERS, 30.0, activity=80.0, altered=altered)
     planned = SimpleNamespace(phantom=phantom, activity_factor=1.0)
     event = SimpleNamespace(planned=planned, placement=np.eye(4), number=0, name="derenzo")

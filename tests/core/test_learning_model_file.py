@@ -34,7 +34,7 @@ from .small_recipes import JUDGE
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory, small_set) -> Path:
-    """A trained model and the events it was trained on."""
+    """Make a trained model and the events it was trained on."""
     folder = tmp_path_factory.mktemp("learned")
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(NETWORKS, "toy", TOY)
@@ -54,13 +54,13 @@ def run(folder) -> mph.ProjectionRun:
 
 
 def with_fewer_modules(run: mph.ProjectionRun) -> mph.ProjectionRun:
-    """A run of another scanner: the last two modules are left out."""
+    """Return a run of another scanner: the last two modules are left out."""
     which = np.arange(len(run.system) - 2)
     return replace(run, projections=run.projections[which], system=run.system[which], views=run.views[which])
 
 
 class Harmful:
-    """What makes a folder when it is unpickled."""
+    """Object that makes a folder when it is unpickled."""
 
     def __init__(self, path: Path) -> None:
         self.path = path

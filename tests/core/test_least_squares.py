@@ -25,7 +25,7 @@ NOISY = IMAGES + RNG.normal(0, 0.5, IMAGES.shape).astype(np.float32)
 
 
 def matrix():
-    """`A` as a dense matrix."""
+    """Return `A` as a dense matrix."""
     unit = np.eye(GRID.n_voxels, dtype=np.float32).reshape(-1, *GRID.shape)
     return np.stack([A(x).ravel() for x in unit], axis=1).astype(float)
 
@@ -64,7 +64,7 @@ def test_cgls_reaches_the_solution_of_numpys_lstsq():
 
 
 def cgls_of_double_precision(B, images, iterations, mask):
-    """The textbook's, over the float64 reference: the volume after each iteration."""
+    """Return the volume after each iteration of the textbook's CGLS over the float64 reference."""
     B = mph.Projector(B.grid, B.views, B.model, backend="numpy")
     x, residual = np.zeros(B.shape_in), images.astype(float)
     direction = B.T(residual) * mask

@@ -16,7 +16,7 @@ DEGREE = math.radians(1)
 
 
 def pinholes(directions, radius=250.0):
-    """Modules in these directions from the isocentre, whose fields of view hold all around it."""
+    """Return modules in these directions from the isocentre, whose fields of view hold all around it."""
     directions = np.asarray(directions, float)
     directions = directions / np.linalg.norm(directions, axis=1)[:, None]
     return mph.PinholeSystem(radius * directions, 2.0, 50.0, 100.0, 10.0, 75.0)

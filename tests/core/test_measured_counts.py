@@ -40,7 +40,7 @@ def test_the_projector_of_a_run_makes_its_images(system, entries):
 
 @pytest.fixture
 def measured(system) -> mph.ProjectionRun:
-    """What a scanner would measure: whole counts on its crystals, all different."""
+    """Return what a scanner would measure: whole counts on its crystals, all different."""
     counts = np.random.default_rng(1).permutation(12 * 5 * 6).reshape(12, 5, 6)
     recipe = recorded_recipe(mph.Recipe(SMALL | {"model.time": 600.0}))
     settings = {"detector": "real", "recipe": recipe.tables()}
@@ -48,7 +48,7 @@ def measured(system) -> mph.ProjectionRun:
 
 
 def as_file(image: np.ndarray, word: str) -> np.ndarray:
-    """The picture, row 0 at the top, that somebody sees of a crystal's image (n_v, n_u), looked up point by point."""
+    """Return the picture, row 0 at the top, that one sees of a crystal's image (n_v, n_u), looked up point by point."""
     side, up_name = word[:-2], word[-2:]
     up = {"u": np.array([1, 0, 0]), "v": np.array([0, 1, 0])}[up_name[1]] * (1 if up_name[0] == "+" else -1)
     sight = np.array([0, 0, -1 if side == "front" else 1])  # the crystal lies behind the pinhole, against k
@@ -64,7 +64,7 @@ def as_file(image: np.ndarray, word: str) -> np.ndarray:
 
 
 def foreign(run: mph.ProjectionRun, numbers: list[int], word: str) -> np.ndarray:
-    """The run's counts as another program keeps them: a frame for each of `numbers`, so turned."""
+    """Return a run's counts as another program keeps them: a frame for each of `numbers`, turned as `word` says."""
     images = dict(zip(run.system.numbers.tolist(), run.projections, strict=True))
     return np.stack([as_file(images[number], word) for number in numbers]).astype(np.uint16)
 
@@ -98,7 +98,7 @@ def write_dcm(frames, path):
 
 
 def write_mhd(frames, path):
-    """As GATE 10's projections: 32-bit floats."""
+    """Write frames as GATE 10's projections: 32-bit floats."""
     size = " ".join(map(str, frames.shape[::-1]))
     path.write_text(
         f"ObjectType = Image\nNDims = 3\nBinaryData = True\nBinaryDataByteOrderMSB = False\nDimSize = {size}\n"
@@ -109,7 +109,7 @@ def write_mhd(frames, path):
 
 
 def write_hdr(frames, path):
-    """As GATE 9's projections; the files were moved since."""
+    """Write frames as GATE 9's projections; the files were moved since."""
     count, rows, columns = frames.shape
     lines = ["!INTERFILE :=", "!imaging modality := nucmed", "!data starting block := 0", ";", "!GENERAL DATA :="]
     lines += [f"!name of data file := ./out/{path.stem}.sin", f"!total number of images := {count}"]

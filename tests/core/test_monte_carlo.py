@@ -68,7 +68,7 @@ COMMANDS = re.compile(
 
 
 class Volume(NamedTuple):
-    """A volume of a macro: its solid, and its placements in its mother as GATE 9 hands them to Geant4."""
+    """Volume of a macro: its solid, and its placements in its mother as GATE 9 hands them to Geant4."""
 
     mother: str
     shape: str
@@ -82,7 +82,7 @@ class Volume(NamedTuple):
         return float(value)
 
     def world(self, point: tuple[float, float, float]) -> np.ndarray:
-        """A point of the solid at each of its places, (N, 3), in the mother's frame."""
+        """Return a point of the solid at each of its places, (N, 3), in the mother's frame."""
         return self.centers + np.einsum("nij,i->nj", self.frames, point)
 
     def sizes(self) -> tuple[float, float, float]:
@@ -98,7 +98,7 @@ class Volume(NamedTuple):
 
 
 class Macros:
-    """A folder of macros, read as GATE would, from main.mac on."""
+    """Folder of macros, read as GATE would, from main.mac on."""
 
     def __init__(self, folder: Path) -> None:
         self.folder, self.used = folder, {folder / "main.mac"}
@@ -422,7 +422,7 @@ json.dump(described, open("described.json", "w"))
 
 
 def run_gate10(folder: Path, *command: str, **variables: str) -> str:
-    """The output of GATE 10; it must not look for Geant4's data, which it would download."""
+    """Return the output of GATE 10; it must not look for Geant4's data, which it would download."""
     options = {"cwd": folder, "env": {**os.environ, "GATEONRTD": "1", **variables}, "timeout": 600}
     run = subprocess.run([sys.executable, *command], capture_output=True, text=True, **options)
     assert run.returncode == 0, run.stderr
@@ -434,7 +434,7 @@ needs_gate10 = pytest.mark.skipif(not has_gate10, reason="needs opengate (GATE 1
 
 
 def cubic(shape: str, *size: float) -> float:
-    """Volume, mm^3, of a solid."""
+    """Return the volume, mm^3, of a solid."""
     if shape == "box":
         return float(np.prod(size))
     *widths, height = size
@@ -519,7 +519,7 @@ def test_the_script_asks_opengate_who_divides_the_activity(system, tmp_path, han
     script, _ = load_script(export(system, tmp_path / "out", "gate10"))
 
     class Simulation:
-        """The simulation of an opengate that hands `handed(activity, threads)` to each thread, or has no such call."""
+        """Simulation of an opengate that hands `handed(activity, threads)` to each thread, or has no such call."""
 
         number_of_threads = 1
 

@@ -32,7 +32,7 @@ GRID = mph.Grid.centered((8, 8, 8), 12.0)
 
 @pytest.fixture(autouse=True, scope="module")
 def one_thread():
-    """At toy sizes several threads wait for each other longer than they work."""
+    """Use one thread: at toy sizes several wait for each other longer than they work."""
     usual = torch.get_num_threads()
     torch.set_num_threads(1)
     yield
@@ -41,7 +41,7 @@ def one_thread():
 
 @cache
 def setup_of(every: int = 16, permuted: int | None = None, backend: str = "auto", **model: Any) -> ScannerSetup:
-    """Of every n-th module; `model` are settings of its `Emission`."""
+    """Return the setup of every n-th module; `model` are settings of its `Emission`."""
     system = mph.read_system(WORKBOOK)[::every]
     views = system.views(shape=(8, 8), detector="real")
     return ScannerSetup(
@@ -50,7 +50,7 @@ def setup_of(every: int = 16, permuted: int | None = None, backend: str = "auto"
 
 
 def scan(setup: ScannerSetup, seed: int = 1, level: float = 1.0, background: float = 1.0) -> Sample:
-    """Of a few hot voxels."""
+    """Return a scan of a few hot voxels."""
     rng = np.random.default_rng(seed)
     truth = np.zeros(GRID.shape, np.float32)
     truth[2:6, 2:6, 2:6] = rng.uniform(0, 100, (4, 4, 4))
@@ -60,7 +60,7 @@ def scan(setup: ScannerSetup, seed: int = 1, level: float = 1.0, background: flo
 
 
 def network(kind: str, random: bool = True, **options: Any) -> torch.nn.Module:
-    """A small one, of weights that are not those it begins with."""
+    """Return a small network, of weights that are not those it begins with."""
     torch.manual_seed(3)
     model = NETWORKS[kind].load()(**{**SMALL[kind], **options})
     if random:

@@ -17,7 +17,7 @@ ROOT = Path(__file__).resolve().parents[2]
 
 @pytest.fixture(scope="module")
 def maker():
-    """tools/make_notebook.py, as a module."""
+    """Return tools/make_notebook.py, as a module."""
     spec = importlib.util.spec_from_file_location("make_notebook", ROOT / "tools" / "make_notebook.py")
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)

@@ -16,7 +16,7 @@ TURN = mph.euler_pose(0.3, 0.5, 0.2)
 
 
 def box_chords(views, half_sides):
-    """Lengths (M, n_v, n_u) of the rays' lines within the box around the origin, by slabs."""
+    """Return lengths (M, n_v, n_u) of the rays' lines within the box around the origin, by slabs."""
     chords = []
     for m in range(len(views)):
         starts, ends = views.rays(m)

@@ -16,7 +16,7 @@ BLOB = (np.random.default_rng(5).random(GRID.shape) + 0.2).astype(np.float32)
 
 
 def odd_views(parallel=False, coarse=1):
-    """Two views; the second's detector is turned, mirrored and leaning, its pitches differ, its middle is off the axis."""
+    """Return two views; the second's detector is turned, mirrored, leaning and off its axis, and its pitches differ."""
     u, v, k = mph.euler_pose(0.2, 1.1, -0.4)[:3, :3].T
     sources, middles = [[0, -200, 10], -150 * k], [[0, 300, -15], 250 * k + 9 * u - 14 * v]
     u_steps = coarse * np.array([[4.0, 0, 0], 3.6 * u + 0.5 * v + 0.2 * k])
@@ -99,7 +99,7 @@ def test_both_forms_agree_about_a_smooth_volume(spacing):
 
 
 def maps(views, n_k=40):
-    """Pairs of maps of plain arrays, each with its adjoint and the shapes that they take."""
+    """Return pairs of maps of plain arrays, each with its adjoint and the shapes that they take."""
     near, far = mph.depth_ranges(views, GRID)
     g = mph.PerspectiveGrid(views, 0, 17, near[0] - 3, far[0] - 5, "depth")
     h = mph.PerspectiveGrid(views, 1, n_k, near[1] + 2, far[1] + 9)

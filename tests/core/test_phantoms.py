@@ -57,12 +57,12 @@ def title(phantom: mph.Phantom) -> str:
 
 
 def total(volume: mph.Volume) -> float:
-    """kBq, or the same of mu."""
+    """Return the sum over the volume, kBq, or the same of mu."""
     return float(volume.array.sum(dtype=np.float64) * volume.grid.voxel_volume * 1e-3)
 
 
 def lines(rng: np.random.Generator, n: int, reach: float) -> tuple[np.ndarray, np.ndarray]:
-    """Ends of lines (3, n), some along axes and planes, some of length zero."""
+    """Return ends of lines (3, n), some along axes and planes, some of length zero."""
     starts, ends = rng.uniform(-reach, reach, (2, 3, n))
     ends[:2, : n // 8] = starts[:2, : n // 8]
     ends[1:, n // 8 : n // 4] = starts[1:, n // 8 : n // 4]

@@ -22,23 +22,23 @@ TUMOR = ("I-131", (250.0, 700.0))  # three lines
 
 @pytest.fixture
 def module():
-    """A pinhole at x = 200 mm that looks along -x; it is small, as the sources of these laws are."""
+    """Return a pinhole at x = 200 mm that looks along -x; it is small, as the sources of these laws are."""
     return mph.PinholeSystem([[200.0, 0.0, 0.0]], 0.2, 60.0, 0.8, 10.0, roi_radius=60.0)
 
 
 @pytest.fixture
 def ct(rng):
-    """CT numbers of tissues and bone around the isocentre."""
+    """Return CT numbers of tissues and bone around the isocentre."""
     return mph.Volume(rng.uniform(-900, 900, (6, 5, 4)), mph.Grid.centered((6, 5, 4), 20.0), "hu")
 
 
 def water(quantity="hu", value=0.0):
-    """A slab of water between the isocentre and the module."""
+    """Return a slab of water between the isocentre and the module."""
     return mph.Volume(np.full((1, 1, 1), value), mph.Grid.centered(1, (DEPTH, 80.0, 80.0), (60.0, 0.0, 0.0)), quantity)
 
 
 def gaussian_share(energy, window, fwhm):
-    """The share of a Gaussian within a window, by integration."""
+    """Return the share of a Gaussian within a window, by integration."""
     nodes, weights = np.polynomial.legendre.leggauss(200)
     low, high = window
     sigma = fwhm / math.sqrt(8 * math.log(2))
@@ -92,7 +92,7 @@ def several(system, ct=None, **changes):
 
 
 def each_line(system, ct, **changes):
-    """Models of the lines, each in a window of its own."""
+    """Return models of the lines, each in a window of its own."""
     lines = mph.isotope(TUMOR[0]).lines_within(*TUMOR[1])
     return [several(system, mph.hu_to_mu(ct, e), window=(e - 1, e + 1), **changes) for e, _ in lines]
 
@@ -239,7 +239,7 @@ def test_recipes_take_ct_numbers_at_each_line(system, ct, tmp_path):
 
 @pytest.fixture
 def mu_files(ct, tmp_path):
-    """Files of mu for the two lines of In-111 that are counted, and what is in them."""
+    """Write files of mu for the two lines of In-111 that are counted; return their names and contents."""
     files = [tmp_path / f"{energy}.nii.gz" for energy in (171, 245)]
     for file, energy in zip(files, (171.3, 245.4), strict=True):
         mph.write_volume(mph.hu_to_mu(ct, energy), file)

@@ -77,7 +77,7 @@ def test_the_command_takes_a_preset_that_options_override(tmp_path, capsys):
 
 
 def states() -> list[tuple[str, object]]:
-    """Every setting of model, detector and noise with what it may be: its words, and numbers small and large."""
+    """Return every setting of model, detector and noise with what it may be: its words, and numbers small and large."""
     found: list[tuple[str, object]] = []
     for key, setting in SETTINGS.items():
         if not key.startswith(("model.", "detector.", "noise.")):
@@ -100,7 +100,7 @@ STATES = states()
 
 
 def accepted(values: dict[str, object], system: mph.PinholeSystem) -> None:
-    """What the panel asks for is understood by recipe and model, and a run's record of it by the next version."""
+    """Check that recipe and model understand what the panel asks for, and the next version a run's record of it."""
     recipe = fitting_recipe(values)
     if not recipe["model.isotope"]:  # a material attenuates as its photons do: without any it is refused, and must be
         numbers = {"model.aperture_mu": 3.6, "model.crystal_mu": 0.4}

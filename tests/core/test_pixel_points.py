@@ -18,7 +18,7 @@ MODULES = mph.read_system(WORKBOOK)[[3, 10, 21, 38, 62]]  # of all rings; two lo
 
 
 def law(system, grid):
-    """Total counts per module of a volume of ones: the point law integrated over the voxels, 27 points in each."""
+    """Return total counts per module of a volume of ones: the point law over the voxels, 27 points in each."""
     ticks, weights = np.array([-1, 0, 1]) * np.sqrt(0.15), np.array([5, 8, 5]) / 18
     steps = np.stack(np.meshgrid(ticks, ticks, ticks, indexing="ij"), axis=-1).reshape(-1, 3)
     share = np.einsum("i,j,k->ijk", weights, weights, weights).ravel()

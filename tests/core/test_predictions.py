@@ -14,14 +14,14 @@ GRID = mph.Grid((34, 33, 32), mph.euler_pose(0.3, 0.4, 0.5) @ mph.Grid.centered(
 
 
 def blobs(grid: mph.Grid = GRID) -> mph.Volume:
-    """Two smooth ones."""
+    """Return a volume of two smooth blobs."""
     x = np.indices(grid.shape).T @ grid.affine[:3, :3].T + grid.affine[:3, 3]
     first, second = (((x - middle) ** 2).sum(axis=-1) for middle in ((4.0, 3.0, -2.0), (-7.0, -3.0, 5.0)))
     return mph.Volume((np.exp(-first / (2 * 6.0**2)) + 0.6 * np.exp(-second / (2 * 5.0**2))).T, grid)
 
 
 def all_round(parallel: bool = False) -> mph.Views:
-    """Three views of all of the blobs: from the front, odd ones from the sides, with other pixels."""
+    """Return three views of all of the blobs: from the front, odd ones from the sides, with other pixels."""
     u, v, k = mph.euler_pose(0.2, 1.1, -0.4)[:3, :3].T
     size, sources = 0.45 if parallel else 1.0, [[0, -200, 10], -150 * k, [170, 30, 20]]
     middles = [[0, 300, -15], 250 * k + 9 * u - 14 * v, [-200, -40, 0]]

@@ -22,7 +22,7 @@ def rotation(rng):
 
 
 def affine(linear, shape, center=(3.0, -5.0, 2.0)):
-    """An affine with its grid's centre at `center`."""
+    """Return an affine with its grid's centre at `center`."""
     a = np.eye(4)
     a[:3, :3] = linear
     a[:3, 3] = center - a[:3, :3] @ ((np.array(shape) - 1) / 2)
@@ -55,7 +55,7 @@ def clipped_length(grid, sources, targets, index):
 
 
 def random_rays(rng, grid, n=400):
-    """Oblique rays: through, starting inside, ending inside, wholly inside, missing."""
+    """Return oblique rays: through, starting inside, ending inside, wholly inside, missing."""
     size = np.ptp(grid.corners(), axis=0).max()
 
     def points(scale):
@@ -68,7 +68,7 @@ def random_rays(rng, grid, n=400):
 
 
 def nasty_rays(grid, rng):
-    """Rays along axes, faces and edges, through corners, ending on faces, of length zero."""
+    """Return rays along axes, faces and edges, through corners, ending on faces, of length zero."""
     n = np.array(grid.shape)
     starts, ends = [], []
 

@@ -36,13 +36,13 @@ def device(monkeypatch):
 
 @pytest.fixture
 def small_pieces(monkeypatch):
-    """Launches of 17 rays: rows and fans in several pieces."""
+    """Launch 17 rays at once: rows and fans in several pieces."""
     monkeypatch.setattr(cuda, "_RAYS_AT_ONCE", 17)
 
 
 @pytest.fixture
 def fans(rng):
-    """A volume, and the fans of four views."""
+    """Return a volume, and the fans of four views."""
     views = some_views(rng, (7, 30), n=4)
     vectors = np.concatenate([view_rays(views, m).vectors() for m in range(4)])
     fans = index_fans(Grid(SHAPE, affine(LINEAR["sheared"], SHAPE)), vectors, views.shape)
@@ -108,7 +108,7 @@ def single(*arrays):
 
 @pytest.mark.parametrize("rounding", [False, True])
 def test_derivatives_depend_on_mu_and_not_on_its_grid(rounding, rng):
-    """mu on the volume's lattice, on a twice finer, a larger and a smaller one: planes of both are crossed at once."""
+    """With mu on the volume's lattice, a twice finer, a larger and a smaller one, planes of both are crossed at once."""
     volume, mu = single(rng.random(SHAPE), rng.random(SHAPE) * 0.1)
     mu[0], mu[:, :, 3:] = 0, 0
     starts, ends = rng.normal(size=(2, 3000, 3)) * 6 + np.array(SHAPE) / 2

@@ -138,7 +138,7 @@ def ct() -> mph.Volume:
 
 
 def _said_nothing(volume: mph.Volume, path) -> None:
-    """A file as other programs write it."""
+    """Write a file as other programs write it."""
     import nibabel
 
     nibabel.save(nibabel.Nifti1Image(volume.array, volume.grid.affine), path)

@@ -238,7 +238,7 @@ def test_a_methods_own_settings_reach_it(name, typed, given, run, radiograph, tm
 
 @pytest.fixture
 def toy(monkeypatch, tmp_path) -> Path:
-    """A file of a kind that methods may have: the number that all voxels become, by no iterations and no objective."""
+    """Add a method that reads a file, the number that all voxels become, by no iterations and no objective."""
 
     def read(path: Path) -> Method:
         try:

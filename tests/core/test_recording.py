@@ -16,7 +16,7 @@ from mphdrr.core.recording import recorded_warnings
 
 @pytest.fixture(autouse=True)
 def shown(monkeypatch):
-    """The warnings shown without a recorder; afterwards everything is as before."""
+    """Yield the warnings shown without a recorder; afterwards everything is as before."""
     shown: list[str] = []
 
     def show(message, category, *where, **more):

@@ -25,7 +25,7 @@ POSE = mph.euler_pose(0.0, np.deg2rad(20), 0.0, (1, 2, 3))
 
 @pytest.fixture(scope="module")
 def files(tmp_path_factory):
-    """A blurred phantom and its truth on a finer grid, as files."""
+    """Write a blurred phantom and its truth on a finer grid as files."""
     folder = tmp_path_factory.mktemp("score")
     truth = PHANTOM.voxelize(mph.Grid.centered((44, 44, 32), 1.2, center=(1, 2, 3)), POSE)
     coarse = PHANTOM.voxelize(mph.Grid.centered((40, 40, 30), 1.35, center=(1, 2, 3)), POSE)

@@ -27,7 +27,7 @@ def uniform(value: float, grid: mph.Grid) -> mph.Volume:
 
 @functools.cache
 def blurred_disc(radius: float, sigma: float) -> np.ndarray:
-    """A disc of 1 after a Gaussian blur, at DISTANCES from its centre: the integral of Rice's distribution."""
+    """Return a disc of 1 after a Gaussian blur, at DISTANCES from its centre: the integral of Rice's distribution."""
 
     def density(r: float, d: float) -> float:
         return r / sigma**2 * np.exp(-((r - d) ** 2) / (2 * sigma**2)) * i0e(r * d / sigma**2)
@@ -36,7 +36,7 @@ def blurred_disc(radius: float, sigma: float) -> np.ndarray:
 
 
 def blurred_rods(points: np.ndarray, sigma: float) -> np.ndarray:
-    """PHANTOM's rods, endless and blurred, at points (..., 2)."""
+    """Return PHANTOM's rods, endless and blurred, at points (..., 2)."""
     total = np.zeros(points.shape[:-1])
     for _, x, y, w in PHANTOM.rods():
         total += np.interp(np.hypot(points[..., 0] - x, points[..., 1] - y), DISTANCES, blurred_disc(w / 2, sigma))
@@ -77,7 +77,7 @@ WIDE = mph.DerenzoPhantom(26.0, (6.5, 6.0, 5.0, 4.0, 3.5, 3.0), 16.0, activity=1
 
 
 def smoothed(rng: np.random.Generator, grid: mph.Grid, fwhm: float) -> np.ndarray:
-    """Gaussian noise of mean 0 and deviation 1, smoothed to a width in mm."""
+    """Return Gaussian noise of mean 0 and deviation 1, smoothed to a width in mm."""
     noise = gaussian_filter(rng.standard_normal(grid.shape), fwhm / 2.355 / grid.spacing)
     return noise / noise.std()
 
@@ -95,7 +95,7 @@ NOISE = {
 
 
 def falsely_resolved(kind: str, volumes: int, grid: mph.Grid, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """Whether each sector of so many volumes of noise is resolved, and which are of one pair or three."""
+    """Return whether each sector of so many volumes of noise is resolved, and which are of one pair or three."""
     found, small, rng = [], [], np.random.default_rng(seed)
     for i in range(volumes):
         volume = mph.Volume(NOISE[kind](rng, grid), grid)
@@ -313,7 +313,7 @@ GRID = mph.Grid.centered((20, 24, 16), 1.0)
 
 @pytest.fixture
 def pair(rng) -> tuple[mph.Volume, mph.Volume]:
-    """A truth of blobs, and the same with noise."""
+    """Return blobs with noise, and without, the truth."""
     values = gaussian_filter(rng.random(GRID.shape), 2.0) * 40
     return mph.Volume(values + 0.5 * rng.standard_normal(GRID.shape), GRID), mph.Volume(values, GRID)
 
@@ -332,7 +332,7 @@ def test_errors_are_those_of_the_definitions(pair):
 
 
 def ssim_by_scipy(x: np.ndarray, y: np.ndarray, span: float) -> float:
-    """As scikit-image's structural_similarity with gaussian_weights and without use_sample_covariance."""
+    """Return SSIM as scikit-image's structural_similarity with gaussian_weights and without use_sample_covariance."""
 
     def windowed(values: np.ndarray) -> np.ndarray:
         return gaussian_filter(values, 1.5, truncate=3.5)[(slice(5, -5),) * values.ndim]

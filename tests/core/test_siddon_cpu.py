@@ -29,7 +29,7 @@ def level(request, monkeypatch):
 
 
 def lattices_of(rng, kind, shape=(7, 6, 9)):
-    """A volume and its rays: without mu, with mu on its lattice, with mu on another lattice."""
+    """Yield a volume and its lattices: without mu, with mu on its lattice, with mu on another lattice."""
     grid = Grid(shape, affine(LINEAR["rotated"], shape))
     other = Grid((5, 8, 4), affine(LINEAR["sheared"] * 1.2, (5, 8, 4)))
     volume = rng.random(shape).astype(kind)

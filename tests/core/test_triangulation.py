@@ -138,7 +138,7 @@ def test_images_that_give_no_place_are_refused(modules, n_pixels, sigma, words):
 
 
 def pair(apart, parallel=False):
-    """Two views 200 mm from the origin, their sources `apart` mm from each other, looking in one direction."""
+    """Return two views 200 mm from the origin, their sources `apart` mm from each other, looking in one direction."""
     sources = np.array([[0, 0, -200.0], [apart, 0, -200]])
     return mph.Views(sources, sources + np.array([0, 0, 400]), [[1, 0, 0]] * 2, [[0, 1, 0]] * 2, (256, 256), parallel)
 

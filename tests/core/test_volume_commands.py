@@ -17,7 +17,7 @@ from .test_meshes import box
 
 @pytest.fixture
 def ct(tmp_path):
-    """Water in air, off the isocentre, x to the left."""
+    """Return water in air, off the isocentre, x to the left."""
     affine = np.diag([-2.0, 2, 3, 1])
     affine[:3, 3] = [100, -40, 300]
     array = np.full((20, 22, 16), -1000.0)

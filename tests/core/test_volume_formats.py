@@ -29,7 +29,7 @@ CHEST = Path(__file__).parents[3] / "shared" / "data" / "chest_ct_3mm.nii.gz"
 
 
 def turned_grid(shape=(5, 6, 7)) -> mph.Grid:
-    """Oblique, with right angles and iz towards the head: a grid that a series can express."""
+    """Return an oblique grid, with right angles and iz towards the head, that a series can express."""
     affine = euler_pose(0.3, 0.2, -0.1, (10, -20, 30))
     affine[:3, :3] @= np.diag([0.7, 0.9, 2.5])
     return mph.Grid(shape, affine)

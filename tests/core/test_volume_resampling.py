@@ -21,7 +21,7 @@ def mass(volume: mph.Volume) -> float:
 
 
 def permuted_grid() -> mph.Grid:
-    """Axes parallel to the world's, in another order, one backwards."""
+    """Return a grid with axes parallel to the world's, in another order, one backwards."""
     affine = np.array([[0, 0, 1.7, -5], [-0.9, 0, 0, 6], [0, 1.3, 0, -4], [0, 0, 0, 1.0]])
     return mph.Grid((11, 7, 6), affine)
 

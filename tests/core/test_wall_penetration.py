@@ -19,26 +19,26 @@ SIDE, LENGTH = 40.0, 60.0
 
 
 def two_modules(hole=4.0):
-    """Two modules side by side, 50 mm apart, aimed at the isocentre."""
+    """Return two modules side by side, 50 mm apart, aimed at the isocentre."""
     places = [[400 * math.sin(t), -400 * math.cos(t), 0.0] for t in (0.0, 0.125)]
     return mph.PinholeSystem(places, hole, LENGTH, SIDE, 10.0, 50.0)
 
 
 def profile(hole):
-    """Half-widths, mm, of a collimator's front and of its channel's begin, 1 mm before and behind the hole."""
+    """Return half-widths, mm, of a collimator's front and of its channel's begin, 1 mm before and behind the hole."""
     built = Collimator(hole, LENGTH, SIDE, Construction(PLATE, WALL))
     return built.front_half_width, built.channel_half_width
 
 
 def beside_and_through(system, **more):
-    """The models of what comes beside the first module's hole, and through the second one's."""
+    """Return the models of what comes beside the first module's hole, and through the second one's."""
     given = {"aperture_mu": MU, "wall_thickness": WALL, "aperture_points": 30, "pixel_points": 34, **more}
     _, *parts = models_with_walls(mph.Emission(system, **given))
     return [next(part for part in parts if part.holes[0] == hole) for hole in (0, 1)]
 
 
 def counted(system, model, place, size, pixels=32, n=1):
-    """Of one decay a second in a cube the first module's counts."""
+    """Return the first module's counts of one decay a second in a cube."""
     grid = mph.Grid.centered((n, n, n), size / n, place)
     return mph.Projector(grid, system.views((pixels, pixels)), model)(np.full(grid.shape, size**-3))[0].sum()
 
@@ -58,10 +58,10 @@ def test_walls_that_stop_all_leave_every_count_as_it_is(rng):
 
 
 def traced(system, place, size, points, areas, of_hole, rng):
-    """What is counted in the first crystal of a decay a second in a cube, by photons from random places of it to random
-    points of a plane, each of which stands for its area; and its standard deviation.
+    """Return the first crystal's counts of a decay a second in a cube, and their standard deviation.
 
-    Steps between collisions are exponential, in a material that fills everything: where it is none, they are not counted.
+    Photons go from random places of it to random points of a plane, each of which stands for its area. Steps between
+    collisions are exponential, in a material that fills everything: where it is none, they are not counted.
     """
     n, (hole, normal) = len(points), (1 if of_hole else 0, system.frames()[1 if of_hole else 0, 2])
     start = place + size * (rng.random((n, 3)) - 0.5)

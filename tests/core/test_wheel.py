@@ -28,7 +28,7 @@ SCRIPT = Path(__file__).parent / "data" / "user_script.py"
 
 @pytest.fixture(scope="session")
 def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Built without the kernels' library, from a copy of the tree."""
+    """Build the wheel without the kernels' library, from a copy of the tree."""
     pytest.importorskip("pip")
     folder = tmp_path_factory.mktemp("wheel")
     leave = shutil.ignore_patterns(".*", "out", "dist", "build", "*.egg-info", "__pycache__", "docs", "benchmarks")
@@ -43,7 +43,7 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def installed(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    """The Python of an environment that has the wheel, and all else of this one."""
+    """Yield the Python of an environment that has the wheel, and all else of this one."""
     folder = tmp_path_factory.mktemp("installed")
     venv.create(folder, with_pip=False)
     (site,) = [*folder.glob("lib/python*/site-packages"), *folder.glob("Lib/site-packages")]

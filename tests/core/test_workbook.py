@@ -12,6 +12,7 @@ import shutil
 import tracemalloc
 import zipfile
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -30,66 +31,10 @@ from mphdrr.core.workbook.formulas import CellError, FormulaContext, NotComputab
 from mphdrr.core.workbook.headings import get_vocabulary
 
 from . import libreoffice
+from .nasty.layouts import CENTERS, PLAIN, SCANNER, laid_out
+from .workbooks import DIMENSIONS, plain
 
 pytestmark = pytest.mark.filterwarnings("error")
-
-SYMBOLS = ["", "x1", "y1", "z1", "b", "S", "l", "l + b+Td", "x2", "y2", "z2", "", "", ""]
-DESCRIPTIONS = [
-    "Definitions",
-    "x coordinate value at center of hole",
-    "y coordinate value at center of hole",
-    "z coordinate value at center of hole",
-    "distance from center of hole to center of heart",
-    "3D slope",
-    "length of collimator",
-    "",
-    "x coordinate value at end of detector",
-    "y coordinate value at end of detector",
-    "z coordinate value at end of detector",
-    "pinhole range",
-    "pinhole azimuth (radians)",
-    "pinhole elevation (radians)",
-]
-FORMULAS = {
-    5: "=SQRT(SUMSQ(B{0},C{0},D{0}))",
-    6: "=E{0}/B{0}",
-    7: "=(Main!D{1}-Main!B{1})*(E{0}^2-Main!C{1}^2)/(E{0}*Main!B{1}"
-    "+2*Main!C{1}*SQRT(E{0}^2-Main!C{1}^2+Main!B{1}^2/4))",
-    8: "=E{0}+G{0}+Main!E{1}",
-    9: "=B{0}*H{0}/E{0}",
-    10: "=C{0}*H{0}/E{0}",
-    11: "=D{0}*H{0}/E{0}",
-    12: "=SQRT(SUMSQ(B{0},C{0}))",
-    13: "=(ATAN2(B{0},C{0}))",
-    14: "=(ATAN2(L{0},D{0}))",
-}
-CENTERS = np.array([[277.0, 70.3, -70.0], [155.0, 158.4, -70.9], [-63.1, -245.8, 70.4], [-10.5, 190.25, 12.0]])
-DIMENSIONS = {"d": 2.3, "R": 75.0, "Ld": 50.0, "Td": 10.0}
-
-
-def plain(centers: np.ndarray = CENTERS) -> Workbook:
-    """A workbook in the users' layout, its formulas without values: modules in rows 3, 4, ..."""
-    book = Workbook()
-    main, coordinates = book.active, book.create_sheet("Coordinates")
-    main.title = "Main"
-    main.append(["", "d", "R", "Ld", "Td"])
-    main.append(
-        [
-            "Definitions",
-            "diameter of pinhole",
-            "radius of spherical region of interest",
-            "length of side of detector crystal",
-            "thickness of detector crystal",
-        ]
-    )
-    coordinates.append(SYMBOLS)
-    coordinates.append(DESCRIPTIONS)
-    for number, center in enumerate(centers, start=1):
-        main.append([number, *DIMENSIONS.values()])
-        coordinates.append([number, *map(float, center)])
-        for column, formula in FORMULAS.items():
-            coordinates.cell(number + 2, column, formula.format(number + 2, number + 2))
-    return book
 
 
 def saved(book: Workbook, folder: Path, name: str = "scanner.xlsx") -> Path:
@@ -99,20 +44,17 @@ def saved(book: Workbook, folder: Path, name: str = "scanner.xlsx") -> Path:
 
 
 def read_edited(folder: Path, edit: Callable[[Worksheet, Worksheet], object]):
-    """The system read from the plain workbook after `edit(main, coordinates)`."""
+    """Return the system read from the plain workbook after `edit(main, coordinates)`."""
     book = plain()
     edit(book["Main"], book["Coordinates"])
     return read_system(saved(book, folder))
 
 
-def assert_plain(system, n: int = len(CENTERS)) -> None:
-    np.testing.assert_array_equal(system.centers, CENTERS[:n])
-    for name, value in zip(
-        ("pinhole_diameter", "roi_radius", "detector_side", "detector_thickness"), DIMENSIONS.values(), strict=True
-    ):
-        np.testing.assert_array_equal(getattr(system, name), np.full(n, value))
-    expected = collimator_length(np.linalg.norm(CENTERS[:n], axis=1), 2.3, 50, 75)
-    np.testing.assert_allclose(system.collimator_length, expected, rtol=1e-12)
+def assert_plain(system) -> None:
+    """Compare with the plain workbook's scanner."""
+    for name in ("centers", *DIMENSIONS.values()):
+        np.testing.assert_array_equal(getattr(system, name), getattr(SCANNER, name))
+    np.testing.assert_allclose(system.collimator_length, SCANNER.collimator_length, rtol=1e-12)
 
 
 # The real workbook
@@ -173,16 +115,9 @@ def test_reading_leaves_file_untouched_and_open_to_others(workbook, tmp_path):
 
 
 def _typed(main: Worksheet, coordinates: Worksheet) -> None:
-    for row in range(3, coordinates.max_row + 1):
-        center = np.array([coordinates.cell(row, column).value for column in (2, 3, 4)])
-        b = float(np.linalg.norm(center))
-        planar = float(np.hypot(*center[:2]))
-        length = float(collimator_length(b, 2.3, 50, 75))
-        end = b + length + 10
-        derived = [b, b / center[0], length, end, *(center * end / b), planar]
-        derived += [np.arctan2(center[1], center[0]), np.arctan2(center[2], planar)]
-        for column, value in enumerate(derived, start=5):
-            coordinates.cell(row, column, float(value))
+    for at, value in laid_out(replace(PLAIN, formulas="typed"), SCANNER).book["Coordinates"].cells.items():
+        if str(coordinates[at].value).startswith("="):
+            coordinates[at] = value
 
 
 def _moved_down(main: Worksheet, coordinates: Worksheet) -> None:
@@ -696,10 +631,7 @@ def test_file_of_absurd_size_is_refused_unread(workbook, tmp_path, monkeypatch):
 def test_a_sheet_of_300_mb_of_blanks_is_refused_without_unpacking_it(workbook, tmp_path):
     """Also where the archive lies about the size."""
     name, bomb = "xl/worksheets/sheet1.xml", tmp_path / "bomb.xlsx"
-    with (
-        zipfile.ZipFile(workbook) as old,
-        zipfile.ZipFile(bomb, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as new,
-    ):
+    with zipfile.ZipFile(workbook) as old, zipfile.ZipFile(bomb, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as new:
         for info in old.infolist():
             with new.open(info.filename, "w") as part:
                 before, data, after = old.read(info).partition(b"<sheetData>")

@@ -13,8 +13,8 @@ import mphdrr.core as mph
 from mphdrr.core.cli import main
 from mphdrr.core.geometry.columns import Column
 
-from .test_workbook import plain, saved
-from .workbooks import edited
+from .test_workbook import saved
+from .workbooks import edited, plain
 
 pytestmark = pytest.mark.filterwarnings("error")
 

@@ -24,7 +24,7 @@ pytestmark = pytest.mark.filterwarnings("error")
 
 @pytest.fixture(scope="module")
 def xray():
-    """The class of the toy kind, known while this file's tests run."""
+    """Return the class of the toy kind, known while this file's tests run."""
     columns = ColumnTable(
         [
             *(
@@ -81,7 +81,7 @@ def two(xray):
 
 @pytest.fixture
 def both(workbook, two, tmp_path):
-    """The users' workbook with the sheet of the second kind added."""
+    """Return the users' workbook with the sheet of the second kind added."""
     written = mph.write_system(two, tmp_path / "both.xlsx", workbook)
     assert {name.partition("!")[0] for name in written.changed} == {"Toy"}
     assert written.recalculated["Toy!H3"] == pytest.approx(np.hypot(300, 5))

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import io
 import re
-import zipfile
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,7 +10,6 @@ import numpy as np
 import openpyxl
 import pytest
 from openpyxl.utils import get_column_letter
-from openpyxl.workbook import Workbook
 from openpyxl.worksheet.worksheet import Worksheet
 
 import mphdrr.core as mph
@@ -21,8 +17,10 @@ from mphdrr.core.errors import InputError, InputWarning
 from mphdrr.core.geometry.pinhole_columns import PINHOLE_COLUMNS
 from mphdrr.core.workbook.headings import Heading, get_vocabulary
 
-from .test_workbook import CENTERS, _unnumbered, assert_plain, plain, read_edited, saved
+from .nasty.layouts import CENTERS, PLAIN, Draft, laid_out, scanner
+from .nasty.sheets import Book, Formula, Sheet, by_hand
 from .test_workbook import _typed as typed
+from .test_workbook import _unnumbered, assert_plain, read_edited
 from .workbooks import DIMENSIONS, by_design
 
 pytestmark = pytest.mark.filterwarnings("error")
@@ -147,106 +145,71 @@ def test_a_scanner_in_units_that_nothing_states_is_warned_of(factor, tmp_path):
 # Stored values
 
 
-def edited_xml(book: Workbook, path: Path, change: Callable[[str, str], str], settings: str = "") -> Path:
-    """`book` with each sheet's XML as `change(name, xml)` makes it, and these settings of calculation."""
-    content = io.BytesIO()
-    book.save(content)
-    names = {f"xl/worksheets/sheet{i}.xml": name for i, name in enumerate(book.sheetnames, start=1)}
-    with zipfile.ZipFile(content) as old, zipfile.ZipFile(path, "w") as new:
-        for member in old.namelist():
-            data = old.read(member).decode()
-            if member in names:
-                data = change(names[member], data)
-            if member == "xl/workbook.xml":
-                data = re.sub(r"<calcPr[^>]*/>", f"<calcPr {settings}/>", data)
-            new.writestr(member, data)
-    return path
+BEYOND_US = "XLOOKUP(A6,Z1:Z4,Y1:Y4)"
+ASKED = 'fullCalcOnLoad="1"'
 
 
-def with_values(folder: Path, values: Callable[[str, str], object], settings: str = "", book: Workbook | None = None):
-    """The plain workbook whose formulas store `values(sheet, cell)`."""
-    formula = re.compile(r'<c r="([A-Z]+\d+)"([^>]*)>(<f>.*?</f>)<v\s*/?>(?:</v>)?')
-
-    def change(name: str, xml: str) -> str:
-        return formula.sub(lambda m: f'<c r="{m[1]}"{m[2]}>{m[3]}<v>{values(name, m[1])}</v>', xml)
-
-    return edited_xml(book or plain(), folder / "scanner.xlsx", change, settings)
+def draft_of(formulas: str, centers: np.ndarray = CENTERS) -> Draft:
+    """Return the plain workbook whose formulas are stored, with their values or zeros, or typed."""
+    return laid_out(replace(PLAIN, formulas=formulas), scanner(centers))
 
 
-def typed_xml(folder: Path, change: Callable[[str], str], settings: str = "") -> Path:
-    """The plain workbook with typed numbers, the XML of Coordinates as `change` makes it."""
-    book = plain()
-    typed(book["Main"], book["Coordinates"])
-    path = folder / "scanner.xlsx"
-    return edited_xml(book, path, lambda name, xml: change(xml) if name == "Coordinates" else xml, settings)
+def file_of(book: Book, folder: Path, settings: str = "") -> Path:
+    """Write a book with these settings of calculation, and return its path."""
+    book.calculation = f"<calcPr {settings}/>"
+    by_hand(book, folder / "scanner.xlsx")
+    return folder / "scanner.xlsx"
 
 
-def right_values(folder: Path, book: Workbook | None = None) -> dict[tuple[str, str], object]:
-    """What the formulas of the plain workbook, or of a `book` in its layout, give: (sheet, cell) -> number."""
-    system = mph.read_system(saved(book or plain(), folder, "right.xlsx"))
-    written = mph.write_system(system, folder / "new.xlsx")
-    cells = openpyxl.load_workbook(written.path, data_only=True)["Coordinates"]
-    columns = zip("DEFGHIJKLMN", "DEFGHIJKUVW", strict=True)
-    rows = range(3, 3 + len(system))
-    return {("Coordinates", f"{own}{row}"): cells[f"{new}{row}"].value for own, new in columns for row in rows}
-
-
-@pytest.mark.parametrize("settings", ["", 'fullCalcOnLoad="1"'])
+@pytest.mark.parametrize("settings", ["", ASKED])
 def test_zeros_stored_for_all_formulas_count_as_not_stored(settings, tmp_path):
-    assert_plain(mph.read_system(with_values(tmp_path, lambda *at: 0, settings)))
-    columns = mph.draft_column_map(tmp_path / "scanner.xlsx").columns
-    assert_plain(mph.read_system(tmp_path / "scanner.xlsx", columns))
+    path = file_of(draft_of("zeros").book, tmp_path, settings)
+    assert_plain(mph.read_system(path))
+    assert_plain(mph.read_system(path, mph.draft_column_map(path).columns))
 
 
-@pytest.mark.parametrize("settings", ["", 'fullCalcOnLoad="1"'])
-@pytest.mark.parametrize("calculated", ["E4", "W5", "N3"])
+@pytest.mark.parametrize("settings", ["", ASKED])
+@pytest.mark.parametrize("calculated", ["E4", "N3", "of a sheet that nobody reads"])
 def test_zeros_beside_a_calculated_formula_are_refused_with_both_numbers(calculated, settings, tmp_path):
     """One formula that stores its result says that the file was calculated: the zeros are then out of date."""
-    right = right_values(tmp_path)
-    value = right.get(("Coordinates", calculated), 1.5)
-    values = {("Coordinates", calculated): value} if calculated != "W5" else {}
-    book = plain()
-    if calculated == "W5":  # a formula of a sheet that nobody reads
-        book.create_sheet("Theta")["A1"] = "=Coordinates!B3*2"
-        values["Theta", "A1"] = 554
+    book = draft_of("zeros").book
+    if calculated in ("E4", "N3"):
+        book["Coordinates"][calculated] = draft_of("stored").book["Coordinates"][calculated]
+    else:
+        book.sheets.append(Sheet("Theta", {"A1": Formula("Coordinates!B3*2", 554.0)}))
     with pytest.raises(InputError, match=r"Coordinates!\w+ stores 0, but its formula =.* gives -?\d+\.\d+"):
-        mph.read_system(with_values(tmp_path, lambda *at: values.get(at, 0), settings, book))
+        mph.read_system(file_of(book, tmp_path, settings))
 
 
-def test_zeros_of_formulas_that_are_zero_are_read_in_either_case(tmp_path):
+@pytest.mark.parametrize("formulas", ["stored", "zeros"])
+def test_zeros_of_formulas_that_are_zero_are_read_in_either_case(formulas, tmp_path):
     """The ring of a scanner at z = 0, by formula: stored by a program that calculates, and by one that does not."""
-    expected = None
-    for store in (lambda right, at: right, lambda right, at: 0):
-        book = plain(np.array([[277.0, 70.3, 0.0], [155.0, 158.4, 0.0], [-63.1, -245.8, 0.0]]))
-        for row in (3, 4, 5):
-            book["Coordinates"][f"D{row}"] = f"=B{row}-B{row}"
-        stored = right_values(tmp_path, book)
-        path = with_values(tmp_path, lambda *at, store=store, stored=stored: store(stored[at], at), "", book)
-        read = mph.read_system(path)
-        expected = read if expected is None else expected
-        np.testing.assert_array_equal(read.centers, expected.centers)
-        np.testing.assert_array_equal(read.centers[:, 2], 0)
+    centers = np.array([[277.0, 70.3, 0.0], [155.0, 158.4, 0.0], [-63.1, -245.8, 0.0]])
+    book = draft_of(formulas, centers).book
+    for row in (3, 4, 5):
+        book["Coordinates"][f"D{row}"] = Formula(f"B{row}-B{row}", 0.0)
+    np.testing.assert_array_equal(mph.read_system(file_of(book, tmp_path)).centers, centers)
 
 
 def test_zeros_of_formulas_beyond_us_are_refused_where_nothing_was_calculated(tmp_path):
-    book = plain()
-    book["Coordinates"]["D6"] = "=XLOOKUP(A6,Z1:Z4,Y1:Y4)"
+    book = draft_of("zeros").book
+    book["Coordinates"]["D6"] = Formula(BEYOND_US, 0)
     with pytest.raises(InputError, match=r"Coordinates!D6 holds the formula =XLOOKUP.*stores 0.*") as refusal:
-        mph.read_system(with_values(tmp_path, lambda *at: 0, "", book))
+        mph.read_system(file_of(book, tmp_path))
     assert "\n" not in str(refusal.value)
-    book = plain()
+    book = draft_of("zeros").book
     for row in range(3, 7):  # a number that is only compared
-        book["Coordinates"][f"M{row}"] = f"=XLOOKUP(A{row},Z1:Z4,Y1:Y4)"
-    assert_plain(mph.read_system(with_values(tmp_path, lambda *at: 0, "", book)))
+        book["Coordinates"][f"M{row}"] = Formula(BEYOND_US.replace("A6", f"A{row}"), 0)
+    assert_plain(mph.read_system(file_of(book, tmp_path)))
 
 
 def test_what_is_written_into_a_workbook_of_zeros_stores_all_values(tmp_path):
     """In every sheet: no zero stays beside calculated numbers, where it would count."""
-    book = plain()
+    book = draft_of("zeros").book
     for row in range(3, 7):
-        book["Main"][f"D{row}"] = "=2*25"
-    book.create_sheet("Theta")["A1"] = "=SUM(Main!D3:D6)+Coordinates!G3"
-    template = with_values(tmp_path, lambda *at: 0, "", book)
+        book["Main"][f"D{row}"] = Formula("2*25", 0)
+    book.sheets.append(Sheet("Theta", {"A1": Formula("SUM(Main!D3:D6)+Coordinates!G3", 0)}))
+    template = file_of(book, tmp_path)
     system = mph.read_system(template)
     assert mph.write_system(system, tmp_path / "same.xlsx", template).path.read_bytes() == template.read_bytes()
     moved = by_design(replace(system, centers=system.centers * 1.1))
@@ -280,32 +243,22 @@ def test_the_example_written_again_by_xlsxwriter_is_read(constant_memory, workbo
 
 
 def test_a_length_stored_before_its_diameter_changed_is_refused_with_both_numbers(tmp_path):
-    right, book = right_values(tmp_path), plain()
+    book = draft_of("stored").book
     book["Main"]["B4"] = 4.6
-    stored = right["Coordinates", "G4"]
+    stored = book["Coordinates"]["G4"].stored
     with pytest.raises(InputError, match=rf"Coordinates!G4 stores {stored:.9g}, but its formula .* gives \d+"):
-        mph.read_system(with_values(tmp_path, lambda *at: right[at], book=book))
-
-
-def _formula(cell: str, formula: str, stored: str) -> Callable[[str], str]:
-    def edit(xml: str) -> str:
-        new = f'<c r="{cell}"><f>{formula}</f><v>{stored}</v></c>'
-        return re.sub(rf'<c r="{cell}"[^>]*>.*?</c>', new, xml)
-
-    return edit
-
-
-def test_a_zero_of_a_formula_beyond_us_is_refused_where_the_file_asks_for_calculation(tmp_path):
-    change = _formula("D6", "XLOOKUP(A6,Z1:Z4,Y1:Y4)", "0")
-    with pytest.raises(InputError, match=r"Coordinates!D6 holds the formula =XLOOKUP.*stores 0"):
-        mph.read_system(typed_xml(tmp_path, change, 'fullCalcOnLoad="1"'))
+        mph.read_system(file_of(book, tmp_path))
 
 
 def test_a_number_of_a_formula_beyond_us_is_used_and_warned_of_where_the_file_asks_for_calculation(tmp_path):
-    path = typed_xml(tmp_path, _formula("D6", "XLOOKUP(A6,Z1:Z4,Y1:Y4)", "12"), 'fullCalcOnLoad="1"')
+    book = draft_of("typed").book
+    book["Coordinates"]["D6"] = Formula(BEYOND_US, 0.0)
+    with pytest.raises(InputError, match=r"Coordinates!D6 holds the formula =XLOOKUP.*stores 0"):
+        mph.read_system(file_of(book, tmp_path, ASKED))
+    book["Coordinates"]["D6"] = Formula(BEYOND_US, 12.0)
     with pytest.warns(InputWarning, match=r"Coordinates!D6: the stored value is used, though the file asks"):
-        assert mph.read_system(path).centers[3, 2] == 12
-    assert_plain(mph.read_system(typed_xml(tmp_path, _formula("D6", "XLOOKUP(A6,Z1:Z4,Y1:Y4)", "12"))))
+        assert mph.read_system(file_of(book, tmp_path, ASKED)).centers[3, 2] == 12
+    assert_plain(mph.read_system(file_of(book, tmp_path)))
 
 
 # The file

@@ -26,7 +26,18 @@ from openpyxl.worksheet.table import Table
 import mphdrr
 import mphdrr.core as mph
 
-from .workbooks import Layout, by_design, content_of, laid_out, read_quietly, values_of, write_quietly
+from .workbooks import (
+    TemplateLayout,
+    by_design,
+    content_of,
+    read_quietly,
+    repacked,
+    saved_template,
+    template_content,
+    template_workbook,
+    values_of,
+    write_quietly,
+)
 
 SIZES = ("pinhole_diameter", "detector_side", "detector_thickness", "roi_radius")
 SPREADSHEET = "http://schemas.openxmlformats.org/spreadsheetml/2006/main"
@@ -45,17 +56,6 @@ def infos_of(path: Path) -> list[tuple]:
         ]
 
 
-def repacked(content: bytes, edit) -> bytes:
-    """A workbook with the members' bytes that `edit(name, data)` returns; None omits a member."""
-    out = io.BytesIO()
-    with zipfile.ZipFile(io.BytesIO(content)) as old, zipfile.ZipFile(out, "w") as new:
-        for info in old.infolist():
-            data = edit(info.filename, old.read(info))
-            if data is not None:
-                new.writestr(info, data)
-    return out.getvalue()
-
-
 def moved(system: mph.PinholeSystem) -> mph.PinholeSystem:
     centers = system.centers.copy()
     centers[1] *= 1.03
@@ -64,8 +64,8 @@ def moved(system: mph.PinholeSystem) -> mph.PinholeSystem:
 
 @pytest.fixture
 def rich(tmp_path) -> Path:
-    """A workbook with all that openpyxl loses or rewrites, and macros."""
-    book = laid_out(Layout(seed=5))
+    """Return a workbook with all that openpyxl loses or rewrites, and macros."""
+    book = template_workbook(TemplateLayout(seed=5))
     table = book["Coordinates"]
     chart = LineChart()
     chart.add_data(Reference(table, min_col=2, min_row=2, max_row=6), titles_from_data=True)
@@ -191,7 +191,7 @@ UNREADABLE = {
 
 
 def _edit(system: mph.PinholeSystem) -> mph.PinholeSystem:
-    """Moved, one removed, one added."""
+    """Return the system with one module moved, one removed, one added."""
     part = moved(system)[[0, 1, 3]]
     arrays = {name: np.append(getattr(part, name), getattr(part, name)[0]) for name in SIZES}
     centers = np.concatenate([part.centers, [[7.0, 210.0, 33.125]]])
@@ -200,10 +200,10 @@ def _edit(system: mph.PinholeSystem) -> mph.PinholeSystem:
 
 @pytest.fixture(scope="module")
 def plain_written(tmp_path_factory):
-    """A system, and the result of writing it into a workbook with usual XML."""
+    """Return a system, and the result of writing it into a workbook with usual XML."""
     folder = tmp_path_factory.mktemp("plain")
     plain = folder / "plain.xlsx"
-    plain.write_bytes(content_of(laid_out(Layout(seed=11))))
+    plain.write_bytes(template_content(seed=11))
     system = _edit(read_quietly(plain))
     return system, write_quietly(system, folder / "written.xlsx", plain)
 
@@ -217,7 +217,7 @@ def test_odd_xml_is_patched_in_place(odd, plain_written, tmp_path):
 
     system, expected = plain_written
     template = tmp_path / "t.xlsx"
-    template.write_bytes(repacked(content_of(laid_out(Layout(seed=11))), edit))
+    template.write_bytes(repacked(template_content(seed=11), edit))
     written = write_quietly(system, tmp_path / "o.xlsx", template)
     for data_only in (True, False):
         assert values_of(written.path, data_only) == values_of(expected.path, data_only)
@@ -230,7 +230,7 @@ def test_xml_in_another_encoding_than_utf_8_is_refused(encoding, tmp_path):
         return UNREADABLE[encoding](data.decode()) if name.startswith("xl/worksheets/sheet") else data
 
     template = tmp_path / "t.xlsx"
-    template.write_bytes(repacked(content_of(laid_out(Layout(seed=11))), edit))
+    template.write_bytes(repacked(template_content(seed=11), edit))
     with pytest.raises(mph.InputError, match="not readable XML"):
         mph.read_system(template)
 
@@ -240,13 +240,13 @@ def test_a_list_of_sheets_of_another_kind_is_refused(tmp_path):
         return data.replace(SPREADSHEET.encode(), b"urn:other") if name == "xl/workbook.xml" else data
 
     template = tmp_path / "t.xlsx"
-    template.write_bytes(repacked(content_of(laid_out(Layout(seed=11))), edit))
+    template.write_bytes(repacked(template_content(seed=11), edit))
     with pytest.raises(mph.InputError, match=r"t\.xlsx: .* its sheets are none"):
         write_quietly(moved(read_quietly(template)), tmp_path / "o.xlsx", template)
 
 
 def test_texts_that_were_numbers_in_formulas_and_cells_of_any_type_become_numbers(tmp_path):
-    content = content_of(laid_out(Layout(seed=2, derived="absent", length="absent")))
+    content = template_content(seed=2, derived="absent", length="absent")
 
     def edit(name: str, data: bytes) -> bytes:
         if name != "xl/worksheets/sheet2.xml":
@@ -268,7 +268,7 @@ def test_texts_that_were_numbers_in_formulas_and_cells_of_any_type_become_number
 
 def test_the_other_cells_keep_a_shared_formula(tmp_path):
     """x1 = 3, 5 and so on by one shared formula whose first cell, then second, is overwritten."""
-    content = content_of(laid_out(Layout(seed=2)))
+    content = template_content(seed=2)
 
     def edit(name: str, data: bytes) -> bytes:
         if name != "xl/worksheets/sheet2.xml":
@@ -295,7 +295,7 @@ def test_the_other_cells_keep_a_shared_formula(tmp_path):
 
 
 def test_cells_of_array_formulas_do_not_change_alone(tmp_path):
-    book = laid_out(Layout(seed=2, length="absent", derived="absent"))
+    book = template_workbook(TemplateLayout(seed=2, length="absent", derived="absent"))
     from openpyxl.worksheet.formula import ArrayFormula
 
     template = tmp_path / "t.xlsx"
@@ -316,7 +316,7 @@ def test_cells_of_array_formulas_do_not_change_alone(tmp_path):
 
 
 def test_the_chain_of_calculation_goes_when_formulas_do(tmp_path):
-    content = content_of(laid_out(Layout(seed=2)))
+    content = template_content(seed=2)
     kind = "http://schemas.openxmlformats.org/officeDocument/2006/relationships/calcChain"
 
     def edit(name: str, data: bytes) -> bytes:
@@ -346,8 +346,7 @@ def test_the_chain_of_calculation_goes_when_formulas_do(tmp_path):
 
 
 def test_formulas_stay_through_names_sheets_and_whole_columns(tmp_path):
-    template = tmp_path / "t.xlsx"
-    template.write_bytes(content_of(laid_out(Layout(seed=8))))
+    template = saved_template(tmp_path / "t.xlsx", seed=8)
     system = moved(read_quietly(template))
     written = write_quietly(system, tmp_path / "o.xlsx", template)
     values, x, y, z = values_of(written.path), *system.centers.T
@@ -365,7 +364,7 @@ def test_formulas_stay_through_names_sheets_and_whole_columns(tmp_path):
 
 def test_formulas_of_tables_store_no_value_if_the_table_changes(tmp_path):
     """References to the columns of Excel's tables, one of the modules and one that has nothing to do with them."""
-    content = content_of(laid_out(Layout(n=5, seed=12)))
+    content = template_content(n=5, seed=12)
     book = openpyxl.load_workbook(io.BytesIO(content))
     sheet, other = book["Coordinates"], book.create_sheet("Other")
     for column in range(1, sheet.max_column + 1):
@@ -406,8 +405,7 @@ while True:
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="this system has no SIGKILL")
 @pytest.mark.parametrize("times", [1, pytest.param(8, marks=pytest.mark.long)])
 def test_killed_at_any_moment_the_old_or_the_new_file_is_whole(times, tmp_path, rng):
-    workbook = tmp_path / "a.xlsx"
-    workbook.write_bytes(content_of(laid_out(Layout(seed=6))))
+    workbook = saved_template(tmp_path / "a.xlsx", seed=6)
     a = read_quietly(workbook)
     centers = a.centers.copy()
     centers[:, 0] += 0.5

@@ -22,7 +22,7 @@ VIEWS = mph.xray_arc(shape=(64, 64)).views()
 
 
 def line_integrals(phantom, views, pose=None, photons=PHOTONS, seed=0):
-    """Of voxels half as large, with noise."""
+    """Return line integrals of voxels half as large, with noise."""
     fine = phantom.voxelize(mph.Grid.centered(96, 1.5), pose, quantity="mu")
     passed = photons * np.exp(-np.asarray(mph.Projector(fine.grid, views)(fine)))
     return np.log(photons / np.maximum(mph.sample_counts(passed, seed), 0.5))

@@ -19,7 +19,7 @@ pytestmark = pytest.mark.filterwarnings("error")
 
 
 def one(**changes) -> mph.XraySystem:
-    """A source below the isocentre, and above it a panel of 200 x 300 mm that is neither square nor in the middle."""
+    """Return a source below the isocentre, and above it a panel of 200 x 300 mm, neither square nor in the middle."""
     settings = {
         "sources": [[5.0, -300.0, 2.0]], "panel_centers": [[20.0, 200.0, -30.0]], "panel_u": [[2.0, 0.0, 0.0]],
         "panel_v": [[0.0, 0.0, -3.0]], "shape": (100, 100), "kvp": 80, "mas": 0.5, "filters": {"Al": 2.5},
@@ -153,7 +153,7 @@ def test_presets_have_24_sources_that_see_the_isocentre_in_the_middle(system):
 
 
 def disc(distance: float, half: float, module: int = 1) -> mph.PinholeSystem:
-    """A pinhole module on +y above the source of `one`, so small that its collimator is a known obstacle."""
+    """Return a pinhole module on +y above the source of `one`, so small that its collimator is a known obstacle."""
     return mph.PinholeSystem([[0.0, distance, 0.0]], 1.0, 20.0, 2 * half, 1.0, 10.0, numbers=[module])
 
 

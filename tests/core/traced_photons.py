@@ -19,14 +19,14 @@ def module(**changes):
 
 
 def voxel(system, place, size):
-    """A grid around one voxel of a `size`, mm, at (u, v, depth) before the module's pinhole, along the world's axes."""
+    """Return a grid around a voxel of a `size`, mm, at (u, v, depth) before the pinhole, along the world's axes."""
     affine = np.diag([size, size, size, 1.0])
     affine[:3, 3] = system.centers[0] + np.asarray(place) @ system.frames()[0] - 2 * size
     return mph.Grid((5, 5, 5), affine)
 
 
 def image_of_voxel(system, place, pixels, size=0.3, backend="auto", **model):
-    """The projector's image of one decay a second in such a voxel."""
+    """Return the projector's image of one decay a second in a `voxel`."""
     A = mph.Projector(
         voxel(system, place, size), system.views((pixels, pixels), "virtual"),
         mph.Emission(system, **{"hole": "depth", "within_crystal": True, **model}), backend, double=True,
@@ -37,7 +37,7 @@ def image_of_voxel(system, place, pixels, size=0.3, backend="auto", **model):
 
 
 def traced_image(system, place, pixels, size=0.3, n=2**18, edge_mu=None, plate=20.0, crystal_mu=None):
-    """The same by n photons, spread as evenly as random ones can be. The cone's half angle is 45 degrees."""
+    """Return the image of a decay a second in a `voxel` by n evenly spread photons; the cone's half angle is 45 degrees."""
     d, l, side, thickness = (
         float(each[0])
         for each in (system.pinhole_diameter, system.collimator_length, system.detector_side, system.detector_thickness)
@@ -76,11 +76,11 @@ def traced_image(system, place, pixels, size=0.3, n=2**18, edge_mu=None, plate=2
 
 
 def misplaced(found, expected):
-    """The sum of absolute differences, by all counts."""
+    """Return the sum of absolute differences, by all counts."""
     return np.abs(found - expected).sum() / expected.sum()
 
 
 def in_blocks(image, n):
-    """The image on pixels `n` times as wide."""
+    """Return the image on pixels `n` times as wide."""
     rows, columns = image.shape
     return image.reshape(rows // n, n, columns // n, n).sum(axis=(1, 3))

@@ -1,65 +1,69 @@
-"""Workbooks of random layouts, random changes of their systems, and what other programs read from files."""
+"""Workbooks to be written into, random changes of their systems, and what other programs read from files."""
 
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import io
 import warnings
-from collections.abc import Iterator
+import zipfile
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import openpyxl
-from openpyxl.utils import get_column_letter as letter
+from openpyxl.utils import get_column_letter
 from openpyxl.workbook import Workbook
-from openpyxl.workbook.defined_name import DefinedName
 
 from mphdrr.core import PinholeSystem, WrittenWorkbook, collimator_length, read_system, write_system
+
+from .nasty.layouts import (
+    DERIVED_AND_LENGTH,
+    PLAIN,
+    POSITION,
+    SCANNER,
+    TYPED,
+    Draft,
+    Layout,
+    laid_out,
+    quantity,
+    random_centers,
+    scanner,
+)
+from .nasty.sheets import Formula, Sheet, openpyxl_workbook
 
 DIMENSIONS = {"d": "pinhole_diameter", "R": "roi_radius", "Ld": "detector_side", "Td": "detector_thickness"}
 
 
-def designed(centers, d, R, Ld, Td, numbers=None, length=None) -> PinholeSystem:
-    if length is None:
-        length = collimator_length(np.linalg.norm(centers, axis=1), d, Ld, R)
-    return PinholeSystem(centers, d, length, Ld, Td, R, numbers)
-
-
 def by_design(system: PinholeSystem) -> PinholeSystem:
+    """Return the system with the collimator lengths of the design formula."""
     s = system
-    return dataclasses.replace(
-        s, collimator_length=collimator_length(s.pinhole_distance, s.pinhole_diameter, s.detector_side, s.roi_radius)
-    )
+    length = collimator_length(s.pinhole_distance, s.pinhole_diameter, s.detector_side, s.roi_radius)
+    return replace(s, collimator_length=length)
 
 
 def read_quietly(path) -> PinholeSystem:
+    """Return the system in a file, without its warnings."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         return read_system(path)
 
 
 def write_quietly(system, path, template) -> WrittenWorkbook:
+    """Write a system into a template, without its warnings."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         return write_system(system, path, template)
 
 
-def random_centers(rng, n: int) -> np.ndarray:
-    directions = rng.normal(size=(n, 3))
-    return np.round(directions / np.linalg.norm(directions, axis=1)[:, None] * rng.uniform(120, 300, (n, 1)), 4)
+def plain(centers: np.ndarray = SCANNER.centers) -> Workbook:
+    """Return a workbook in the users' layout, its formulas without values: modules in rows 3, 4, ..."""
+    return openpyxl_workbook(laid_out(PLAIN, scanner(centers)).book)
 
 
-def random_system(rng, n: int, shared: bool) -> PinholeSystem:
-    many = 1 if shared else n
-    d, R, Ld, Td = (np.resize(np.round(rng.uniform(*r, many), 2), n) for r in ((1, 4), (50, 80), (40, 60), (5, 12)))
-    numbers = np.sort(rng.choice(np.arange(1, 400), n, replace=False))
-    return designed(random_centers(rng, n), d, R, Ld, Td, numbers)
-
-
-@dataclasses.dataclass(frozen=True)
-class Layout:
-    """The layout of a random workbook."""
+@dataclass(frozen=True)
+class TemplateLayout:
+    """The layout of a workbook to be written into."""
 
     n: int = 4
     numbered: bool = True
@@ -73,106 +77,85 @@ class Layout:
     seed: int = 0
 
 
-def laid_out(layout: Layout) -> Workbook:
-    """A workbook with the layout, and sheets of formulas that depend on each other and on the table."""
-    rng = np.random.default_rng(layout.seed)
-    system = random_system(rng, layout.n, layout.shared)
-    book = Workbook()
-    main, table = book.active, book.create_sheet("Coordinates")
-    main.title = "Main"
-    if layout.one_sheet:
-        book.remove(main)
-        main = table
-    top, left, n = layout.top, layout.left, layout.n
-    first, last = top + 3, top + 2 + n
-    number, x, y, z = (letter(left + i) for i in (1, 2, 3, 4))
-    column = {name: letter(left + i) for i, name in enumerate(("b", "l", "H", "x2", "azimuth", "elevation"), start=5)}
-    note, user = letter(left + 11), letter(left + 12)
-    dims_left = left + (20 if layout.one_sheet else 0)
-    dim = {name: letter(dims_left + i) for i, name in enumerate(DIMENSIONS, start=2)}
-    prefix = "" if layout.one_sheet else "Main!"
-
-    def dimension(name: str, row: int) -> str:
-        return f"{prefix}${dim[name]}${first}" if layout.shared else f"{prefix}{dim[name]}{row}"
-
-    headings = {x: "x1", y: "y1", z: "z1", note: "note", user: "ratio"}
-    if layout.length != "absent":
-        headings[column["l"]] = "length of collimator"
-    if layout.derived != "absent":
-        headings |= {column["b"]: "b", column["H"]: "l + b+Td", column["x2"]: "x2"}
-        headings |= {column["azimuth"]: "pinhole azimuth (degrees)", column["elevation"]: "pinhole elevation"}
-    for at, text in headings.items():
-        table[f"{at}{top + 2}"] = text
-    for name, at in dim.items():
-        main[f"{at}{top + 2}"] = name
-    b_formula = f"SQRT(SUMSQ({x}#,{y}#,{z}#))"
-    expected = {name: PinholeSystem.columns[name].values(system) for name in PinholeSystem.columns.derived}
-    for i in range(n):
-        row = first + i
-        if layout.numbered:
-            table[f"{number}{row}"] = main[f"{letter(left + 1)}{row}"] = int(system.numbers[i])
-        for at, value in zip((x, y, z), system.centers[i], strict=True):
-            table[f"{at}{row}"] = float(value)
-        table[f"{note}{row}"] = f"note of {i}"
-        if not layout.shared or i == 0:
-            for name, attribute in DIMENSIONS.items():
-                main[f"{dim[name]}{row}"] = float(getattr(system, attribute)[i])
-        d, R, Ld, Td = (dimension(name, row) for name in DIMENSIONS)
-        b = f"{column['b']}{row}" if layout.derived == "formula" else f"({b_formula.replace('#', str(row))})"
-        if layout.length == "formula":
-            table[f"{column['l']}{row}"] = f"=({Ld}-{d})*({b}^2-{R}^2)/({b}*{d}+2*{R}*SQRT({b}^2-{R}^2+{d}^2/4))"
-        elif layout.length == "typed":
-            table[f"{column['l']}{row}"] = float(system.collimator_length[i])
-        length = f"{column['l']}{row}" if layout.length == "formula" else str(float(system.collimator_length[i]))
-        if layout.derived == "formula":
-            table[f"{column['b']}{row}"] = "=" + b_formula.replace("#", str(row))
-            table[f"{column['azimuth']}{row}"] = f"=DEGREES(ATAN2({x}{row},{y}{row}))"
-            table[f"{column['elevation']}{row}"] = f"=ASIN({z}{row}/{column['b']}{row})"
-            if layout.length == "formula":
-                table[f"{column['H']}{row}"] = f"={b}+{length}+{Td}"
-                table[f"{column['x2']}{row}"] = f"={x}{row}*{column['H']}{row}/{b}"
-        elif layout.derived == "typed":
-            for name in ("b", "H", "x2", "azimuth", "elevation"):
-                value = expected[name][i] * (180 / np.pi if name == "azimuth" else 1)
-                table[f"{column[name]}{row}"] = float(value)
-        table[f"{user}{row}"] = f'=IF({z}{row}>0,"up","down")&ROUND({x}{row}/{y}{row},2)'
-    if layout.inputs:
-        table[f"{note}{last + 20}"] = float(system.centers[0, 2])
-        table[f"{z}{first}"] = f"=${note}${last + 20}*1"
-        main[f"{dim['Td']}{first}"] = f"=2*{float(system.detector_thickness[0]) / 2!r}"
-    _summaries(book, table.title, x, y, z, first, last)
-    return book
+def template_workbook(template: TemplateLayout) -> Workbook:
+    """Return a workbook with notes, a column of users and sheets of formulas that depend on the table."""
+    names = (*POSITION, *DERIVED_AND_LENGTH, "note", "ratio", *DIMENSIONS)
+    letters = {name: get_column_letter(template.left + 2 + k) for k, name in enumerate(names)}
+    pinned = names if template.one_sheet else names[:-4]
+    layout = Layout(
+        modules=template.n,
+        seed=3 * template.seed,  # of which the numbers rise
+        second="" if template.one_sheet else "sheet",
+        main_first=True,
+        top=template.top + 1,
+        left=template.left,
+        order=TYPED[:-1] if template.length == "absent" else TYPED,
+        columns=tuple((name, letters[name]) for name in pinned),
+        labels=("numbers", "numbers") if template.numbered else ("", ""),
+        once="cells" if template.shared else "",
+        formulas="unstored",
+    )
+    draft = laid_out(layout)
+    table, system = draft.tables[0], draft.system
+    sheet, rows = table.sheet, table.rows
+    for i, row in enumerate(rows):
+        cell = {name: f"{column}{row}" for name, column in letters.items()}
+        if template.length != "formula" and "l" in layout.order:
+            sheet[cell["l"]] = float(system.collimator_length[i]) if template.length == "typed" else None
+        if template.derived != "formula" and template.length == "formula":
+            text = sheet[cell["l"]].text.replace(cell["b"], f"({sheet[cell['b']].text})")
+            sheet[cell["l"]] = Formula(text)
+        for name in layout.derived:
+            if template.derived == "absent" or (template.length == "blank" and name in ("H", "x2", "y2", "z2")):
+                sheet[cell[name]] = None
+            elif template.derived == "typed":
+                sheet[cell[name]] = float(quantity(system, name)[i] * (180 / np.pi if name == "azimuth" else 1))
+        if template.derived == "formula":
+            sheet[cell["azimuth"]] = Formula(f"DEGREES{sheet[cell['azimuth']].text}")
+        sheet[cell["note"]] = f"note of {i}"
+        sheet[cell["ratio"]] = Formula(f'IF({cell["z1"]}>0,"up","down")&ROUND({cell["x1"]}/{cell["y1"]},2)')
+    for name in layout.derived:
+        text = "pinhole azimuth (degrees)" if name == "azimuth" else sheet[draft.heading(name)]
+        sheet[draft.heading(name)] = None if template.derived == "absent" else text
+    sheet[f"{letters['note']}{table.row}"], sheet[f"{letters['ratio']}{table.row}"] = "note", "ratio"
+    if template.inputs:
+        sheet[f"{letters['note']}{rows[-1] + 20}"] = float(system.centers[0, 2])
+        sheet[draft.at("z1", 0)] = Formula(f"${letters['note']}${rows[-1] + 20}*1")
+        draft.table("Td").sheet[draft.at("Td", 0)] = Formula(f"2*{float(system.detector_thickness[0]) / 2!r}")
+    _add_summaries(draft)
+    return openpyxl_workbook(draft.book)
 
 
-def _summaries(book: Workbook, name: str, x: str, y: str, z: str, first: int, last: int) -> None:
-    """Sheets whose formulas depend on the table directly, through each other, names and whole columns."""
-    theta, values = book.create_sheet("Theta"), book.create_sheet("It's values")
-    book.defined_names["first_x"] = DefinedName("first_x", attr_text=f"{name}!${x}${first}")
-    book.defined_names["all_x"] = DefinedName("all_x", attr_text=f"{name}!${x}${first}:${x}${last}")
+def _add_summaries(draft: Draft) -> None:
+    """Add sheets whose formulas depend on the table directly, through each other, names and whole columns."""
+    table, name = draft.tables[0], draft.tables[0].sheet.name
+    (x, y, z), first, last = (table.columns[q] for q in POSITION), table.rows[0], table.rows[-1]
+    theta, values = Sheet("Theta"), Sheet("It's values")
+    draft.book.sheets += [theta, values]
+    draft.book.names |= {"first_x": f"{name}!${x}${first}", "all_x": f"{name}!${x}${first}:${x}${last}"}
     for i, formula in enumerate(
         [
-            f"=SUM({name}!{x}{first}:{x}{last})",
-            f"=AVERAGE({name}!{y}:{y})",
-            "=first_x*2",
-            "=SUMSQ(all_x)",
-            f"=INDEX({name}!{z}{first}:{z}{last},2)",
-            f"=IFERROR(MATCH({name}!{x}{first + 1},all_x,0),-1)",
-            f"=MAX({name}!{x}{first}:{z}{last})-MIN({name}!{x}{first}:{z}{last})",
-            f"=IF(AND(A1>0,{name}!{x}{first}<>0),1/{name}!{x}{first},COUNT(all_x))",
-            f'=COUNTIF(all_x,">0")+MOD({name}!{y}{first},7)',
-            f"=STDEV({name}!{x}{first}:{x}{last})+INT({name}!{z}{first})+SIGN({name}!{y}{first})",
-            '=SUM(INDIRECT("A1:A4"))',
+            f"SUM({name}!{x}{first}:{x}{last})",
+            f"AVERAGE({name}!{y}:{y})",
+            "first_x*2",
+            "SUMSQ(all_x)",
+            f"INDEX({name}!{z}{first}:{z}{last},2)",
+            f"IFERROR(MATCH({name}!{x}{first + 1},all_x,0),-1)",
+            f"MAX({name}!{x}{first}:{z}{last})-MIN({name}!{x}{first}:{z}{last})",
+            f"IF(AND(A1>0,{name}!{x}{first}<>0),1/{name}!{x}{first},COUNT(all_x))",
+            f'COUNTIF(all_x,">0")+MOD({name}!{y}{first},7)',
+            f"STDEV({name}!{x}{first}:{x}{last})+INT({name}!{z}{first})+SIGN({name}!{y}{first})",
+            'SUM(INDIRECT("A1:A4"))',
         ],
         start=1,
     ):
-        theta[f"A{i}"] = formula
-        values[f"B{i}"] = f"=Theta!A{i}*2+1"
-    values["D1"] = "=SUM(B1:B10)"
-    values["D2"] = "=PI()*10"
+        theta[f"A{i}"] = Formula(formula)
+        values[f"B{i}"] = Formula(f"Theta!A{i}*2+1")
+    values["D1"], values["D2"] = Formula("SUM(B1:B10)"), Formula("PI()*10")
 
 
-def random_change(rng, system: PinholeSystem, layout: Layout) -> PinholeSystem:
-    """A system with moved, removed, added, reordered or renumbered modules and other dimensions."""
+def random_change(rng, system: PinholeSystem, layout: TemplateLayout) -> PinholeSystem:
+    """Return a system with moved, removed, added, reordered or renumbered modules and other dimensions."""
     n = len(system)
     order = np.arange(n)
     if rng.random() < 0.4:
@@ -204,34 +187,47 @@ def random_change(rng, system: PinholeSystem, layout: Layout) -> PinholeSystem:
     changed_system = by_design(PinholeSystem(**arrays))
     if layout.length in ("formula", "typed", "blank") and rng.random() < 0.3:
         factor = np.where(rng.random(len(changed_system)) < 0.5, 1.1, 1.0)
-        changed_system = dataclasses.replace(
-            changed_system, collimator_length=changed_system.collimator_length * factor
-        )
+        changed_system = replace(changed_system, collimator_length=changed_system.collimator_length * factor)
     return changed_system
 
 
 def content_of(book: Workbook) -> bytes:
+    """Return the bytes of a workbook's file."""
     file = io.BytesIO()
     book.save(file)
     return file.getvalue()
 
 
-def saved_layout(path: Path, **layout) -> Path:
-    """The file of a workbook with this layout."""
-    path.write_bytes(content_of(laid_out(Layout(**layout))))
+def template_content(**layout) -> bytes:
+    """Return the bytes of a workbook to be written into."""
+    return content_of(template_workbook(TemplateLayout(**layout)))
+
+
+def saved_template(path: Path, **layout) -> Path:
+    """Write the file of a workbook to be written into, and return its path."""
+    path.write_bytes(template_content(**layout))
     return path
+
+
+def repacked(content: bytes, edit: Callable[[str, bytes], bytes]) -> bytes:
+    """Return a workbook with the members' bytes that `edit(name, data)` returns."""
+    out = io.BytesIO()
+    with zipfile.ZipFile(io.BytesIO(content)) as old, zipfile.ZipFile(out, "w") as new:
+        for info in old.infolist():
+            new.writestr(info, edit(info.filename, old.read(info)))
+    return out.getvalue()
 
 
 @contextlib.contextmanager
 def edited(path: Path) -> Iterator[Workbook]:
-    """A file's workbook, which is saved again."""
+    """Yield a file's workbook, which is saved again."""
     book = openpyxl.load_workbook(path)
     yield book
     book.save(path)
 
 
 def values_of(content: bytes | Path, data_only: bool = True) -> dict[tuple[str, str], object]:
-    """(sheet, cell) -> what openpyxl reads."""
+    """Return (sheet, cell) -> what openpyxl reads."""
     book = openpyxl.load_workbook(io.BytesIO(content) if isinstance(content, bytes) else content, data_only=data_only)
     return {
         (sheet.title, cell.coordinate): cell.value

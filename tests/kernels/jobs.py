@@ -17,14 +17,14 @@ BAD = (np.nan, np.inf, -np.inf, 1e300, -1e300, 5e-324, -1e-310, 0.0, -0.0, 1e30,
 
 @dataclass
 class Made:
-    """A job as check.c reads it, and what compares its results."""
+    """Job as check.c reads it, and the function that compares its results."""
 
     data: bytes
     check: Callable[[Read], None]
 
 
 def packed(kind: str, level: int, *contents: Any) -> bytes:
-    """A job of arrays and of ctypes' structures; `level` is taken modulo the processor's number of levels."""
+    """Pack a job of arrays and ctypes' structures; `level` is taken modulo the processor's number of levels."""
     pieces = (bytes(each) for each in (np.array([KINDS.index(kind), level], np.int64), *contents))
     return b"".join(data + bytes(-len(data) % 8) for data in pieces)
 

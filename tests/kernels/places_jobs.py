@@ -23,7 +23,7 @@ def places_jobs() -> Iterator[Made]:
 
 
 def _matrix(rng: np.random.Generator, kind: str, n: Array, m: Array, middle: float) -> Array:
-    """Rows (5, 4) that put many of the points (n) into an array (m)."""
+    """Return rows (5, 4) that put many of the points (n) into an array (m)."""
     if kind == "border":  # all is exact: places on elements, between them, and on the borders
         whole = rng.integers(-2, 3, (5, 4)) * 0.5
         whole[3:] = [0, 0, 0, rng.choice([0.5, 1.0, 4.0])]
@@ -49,7 +49,7 @@ def _matrix(rng: np.random.Generator, kind: str, n: Array, m: Array, middle: flo
 
 
 def _rounding(job: dict[str, Any], planes: Array, relative: Array, matrix: Array) -> tuple[Array, Array, Array]:
-    """Of all points: whether numbers are within rounding of a border or out of range, by what share a value may be off.
+    """Return which points' numbers are within rounding of a border or out of range, and the allowed errors of values.
 
     A value's share is of the largest number of the array, divided by p3^2 where the job says so. A point is compared where
     it surely is in the array, or surely is not; all places that are computed exactly are.

@@ -41,7 +41,7 @@ WINE = Path("/usr/lib/x86_64-linux-gnu/wine/x86_64-windows")
 
 @dataclass
 class Bundle:
-    """A job of the kernels: all its arrays are of one kind of number; rays are in the index space of their lattice."""
+    """Job of the kernels: all its arrays are of one kind of number; rays are in the index space of their lattice."""
 
     volume: Array
     rays: IndexRays | IndexFans
@@ -53,13 +53,13 @@ class Bundle:
 
 
 def lattice(rng: np.random.Generator, kind: type) -> Array:
-    """Voxels, often few, with zeros among them."""
+    """Return voxels, often few, with zeros among them."""
     shape = rng.integers(1, rng.choice([2, 4, 12]), 3, endpoint=True)
     return (rng.random(shape) * (rng.random(shape) < 0.8)).astype(kind)
 
 
 def points(rng: np.random.Generator, count: int, shape: tuple[int, ...]) -> Array:
-    """Ends of rays in and around a lattice."""
+    """Return ends of rays in and around a lattice."""
     return rng.uniform(-1.0, 2.0, (count, 3)) * shape
 
 
@@ -134,7 +134,7 @@ def bundles() -> Iterator[Bundle]:
 
 
 def packed_rays(bundle: Bundle, level: int) -> bytes:
-    """A bundle as check.c reads it."""
+    """Return a bundle as check.c reads it."""
     rays, attenuation = bundle.rays, bundle.attenuation
     mu = bundle.volume if attenuation is None else attenuation.mu
     mu_rays = None if attenuation is None else attenuation.rays
@@ -154,7 +154,7 @@ def packed_rays(bundle: Bundle, level: int) -> bytes:
 
 
 def expected(bundle: Bundle) -> list[tuple[Array, float]]:
-    """The reference's results for a bundle: arrays in check.c's order, each with the magnitude of its summands.
+    """Return the reference's results for a bundle: arrays in check.c's order, each with the magnitude of its summands.
 
     NaN is not compared.
     """

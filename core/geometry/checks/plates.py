@@ -7,9 +7,8 @@ photons through beside it; all others are found here.
 import math
 from collections.abc import Sequence
 
-from ...physics.optics import Optics
 from ...validation import positive
-from ..collimator import Collimator
+from ..collimator import Collimator, edge_slope
 from ..system import PinholeSystem
 from .report import ThinPlate, Vignetted
 
@@ -61,8 +60,8 @@ def find_thin_plates(
         transmission = math.exp(-mu * plate.plate_thickness)
         widest = max(collimator.hole_radius(plate.front), collimator.hole_radius(plate.back))
         plate_area = (2 * collimator.front_half_width) ** 2 - math.pi * widest**2
-        optics = Optics(aperture_mu=mu, opening_angle=plate.opening_angle)
-        hole_area = math.pi / 4 * optics.effective_diameter(collimator.diameter) ** 2
+        # Paix's effective area, of which core.physics.optics has the whole law
+        hole_area = math.pi / 4 * collimator.diameter * (collimator.diameter + 2 / mu * edge_slope(plate.opening_angle))
         share = transmission * plate_area / hole_area
         if share > MAX_TRANSMITTED:
             findings.append(ThinPlate(number, plate.plate_thickness, transmission, share))

@@ -11,16 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from openpyxl.utils import column_index_from_string, get_column_letter
 
-from .layouts import (
-    DESCRIPTIONS,
-    MILLIMETRES,
-    POSITION,
-    SYMBOLS,
-    TYPED,
-    Draft,
-    Table,
-    formulas_of,
-)
+from .layouts import DESCRIPTIONS, MILLIMETRES, POSITION, SYMBOLS, TYPED, Draft, Table, formulas_of
 from .sheets import Error, Formula, Raw, Rich, Sheet, split
 
 
@@ -142,7 +133,7 @@ WHERE = {
 
 
 def text(draft: Draft, where: str, words: str, meaning: str) -> None:
-    """A text apart from the headings."""
+    """Add a text apart from the headings."""
     table, name = draft.tables[0], next(iter(draft.tables[0].columns))
     sheet, column = table.sheet, table.columns[name]
     left, free = get_column_letter(draft.layout.left + 1), draft.free()
@@ -244,11 +235,11 @@ FORMATS = {
 
 
 def number_format(draft: Draft, code: str | int, meaning: str, scope: str) -> None:
-    """A number format of all columns, of one, or of one cell."""
+    """Set the number format of all columns, of one, or of one cell."""
     plain = draft.plain
     names = draft.layout.order if scope == "all" else draft.layout.order[:1]
     for name in names:
-        for at in draft.cells(name)[: 1 if scope == "a cell" else None]:
+        for at in draft.cells(name)[-1 if scope == "a cell" else None :]:
             draft.table(name).sheet.formats[at] = code
     if meaning.startswith("plain"):
         draft.plain = plain
@@ -329,13 +320,20 @@ SPELLINGS: dict[str, Callable[[str, str], Any]] = {
 }
 
 
+PLAIN_SPELLINGS = [form for form in SPELLINGS if form in ("several lines", "blanks around", "fonts", "CDATA")]
+PLAIN_SPELLINGS += ["a reading of Japanese", "text in the cell, of fonts", "a formula", "a subscript"]
+PLAIN_SPELLINGS += ["full-width letters", "in capitals, spelt otherwise", "a formula without a value"]
+"""Spellings of a heading that the reader must understand, not only refuse."""
+
+
 def _inline(at: str, xml: str) -> str:
+    """Return the XML of a cell with its text in it."""
     return f'<c r="{at}" t="inlineStr"><is>{xml}</is></c>'
 
 
 def heading(draft: Draft, name: str, form: str, meaning: str, every: bool = False) -> None:
-    """Another heading of a column, or of all: a form with its own text, or one of `SPELLINGS`."""
-    names = draft.layout.order if every else [name]
+    """Give a column, or all, another heading: a form with its own text, or one of `SPELLINGS`."""
+    names, plain = draft.layout.order if every else [name], draft.plain
     for q in names:
         sheet, at = draft.table(q).sheet, draft.heading(q)
         own = str(sheet[at])
@@ -344,10 +342,11 @@ def heading(draft: Draft, name: str, form: str, meaning: str, every: bool = Fals
     if meaning not in (SAME, NOBODY, UNMAPPED) and any(q in draft.layout.in_unit for q in names):
         meaning = NOBODY
     mean(draft, meaning, names, *places, draft.table(name).sheet.name)
+    draft.plain = plain and form in PLAIN_SPELLINGS
 
 
 def no_heading(draft: Draft, name: str, form: str) -> None:
-    """A heading that is missing, or merged with others."""
+    """Remove a heading, or merge it with others."""
     table = draft.table(name)
     column, after = table.columns[name], table.columns[TYPED[TYPED.index(name) + 1]]
     if form == "merged across":
@@ -363,7 +362,7 @@ def no_heading(draft: Draft, name: str, form: str) -> None:
 
 
 def groups(draft: Draft, own: str, other: str, names: str, meaning: str) -> None:
-    """x y z under a word, and other numbers headed alike under another word."""
+    """Put x y z under a word, and other numbers headed alike under another word."""
     table = draft.tables[0]
     first, free = table.columns["x1"], draft.free()
     table.sheet[f"{first}{table.row - 1}"], table.sheet[f"{free}{table.row - 1}"] = own, other
@@ -420,7 +419,7 @@ def _copied(draft: Draft, name: str, column: str, head: Any, factor: float) -> N
 
 
 def further_column(draft: Draft, name: str, head: str, meaning: str, own: str = "{}", hidden: str = "") -> None:
-    """A column more with numbers like those of the column `name`, whose heading becomes `own`."""
+    """Add a column with numbers like those of the column `name`, whose heading becomes `own`."""
     plain, table, column = draft.plain, draft.table(name), draft.free()
     if table.sheet is not draft.tables[0].sheet:
         return
@@ -462,7 +461,7 @@ add(further_column, "y1", "serial", SAME, "{}", "second")
 
 
 def second_place(draft: Draft, by_formula: bool) -> None:
-    """d beside the coordinates too: other numbers, or the same by formula."""
+    """Write d beside the coordinates too: other numbers, or the same by formula."""
     table, other, column = draft.tables[0], draft.table("d"), draft.free()
     table.sheet[f"{column}{table.row}"] = "d"
     for row, at in zip(table.rows, draft.cells("d"), strict=True):
@@ -563,7 +562,7 @@ for _kind in ("headings again", "headings and rows", "a legend"):
 
 
 def between(draft: Draft, mark: Any, fill: Any, meaning: str) -> None:
-    """A row between those of the modules, in the first sheet."""
+    """Add a row between those of the modules, in the first sheet."""
     table = draft.tables[0]
     row = table.rows[len(table.rows) // 2]
     table.sheet.moved(down=1, below=row - 1)
@@ -606,7 +605,7 @@ add(filled_down, formulas="stored", unit="", units_of="all")
 
 
 def extra_dimensions(draft: Draft, kind: str) -> None:
-    """A row more or less in one of the two sheets."""
+    """Add or remove a row in one of the two sheets."""
     table, sheet = draft.tables[1], draft.tables[1].sheet
     if kind == "fewer":
         for column in filter(None, (*table.columns.values(), table.number)):
@@ -723,9 +722,9 @@ CELLS: dict[str, tuple[Callable[[float, str], Any], str]] = {
         for xml in (
             *('<c r="{0}" t="d"><v>2021-12-05</v></c>', '<c r="{0}"/>', '<c r="{0}"><v></v></c>'),
             *('<c r="{0}" t="inlineStr"><is><t/></is></c>', '<c r="{0}"><v>1e999</v></c>', '<c r="{0}"><v>NaN</v></c>'),
-            *('<c r="{0}"><v>315mm</v></c>', '<c r="{0}" t="s"><v>9999</v></c>', '<c r="{0}" t="zz"><v>315</v></c>'),
-            *('<c r="{0}"><v>315</v></c><c r="{0}"><v>215</v></c>', '<c r="{0}"><v>315</v><v>215</v></c>'),
-            '<c r="XX3000"><v>315</v></c>',
+            *('<c r="{0}"><v>15mm</v></c>', '<c r="{0}" t="s"><v>9999</v></c>', '<c r="{0}" t="zz"><v>15</v></c>'),
+            *('<c r="{0}"><v>15</v></c><c r="{0}"><v>12</v></c>', '<c r="{0}"><v>15</v><v>12</v></c>'),
+            '<c r="XX3000"><v>15</v></c>',
         )
     },
 }
@@ -738,7 +737,7 @@ def cell(draft: Draft, kind: str) -> None:
     make, meaning = CELLS[kind]
     if isinstance(sheet[at], float):
         sheet[at] = make(sheet[at], at)
-        mean(draft, meaning, (), f"{sheet.name}!{at}", f"{sheet.name}!XX3000", sheet.name if "315" in kind else at)
+        mean(draft, meaning, (), f"{sheet.name}!{at}", f"{sheet.name}!XX3000", sheet.name if "<v>15" in kind else at)
 
 
 for _kind in CELLS:
@@ -791,7 +790,7 @@ SETTINGS = ("", '<calcPr calcId="0" calcMode="manual"/>', '<calcPr calcCompleted
 
 
 def formula(draft: Draft, source: str, stored: str, asked: bool) -> None:
-    """A number by a formula of cells far off, which have changed since or not."""
+    """Put a formula of cells far off, which have changed since or not, in place of a number."""
     name = draft.layout.order[-2]
     sheet, at = draft.table(name).sheet, draft.cells(name)[0]
     value, plain = sheet[at], draft.plain
@@ -823,7 +822,7 @@ for _stored in STORED:
 
 
 def column_of_formulas(draft: Draft, kind: str, values: str) -> None:
-    """A column by formulas of one kind, with all their values, with none, or with one that is stale."""
+    """Put formulas of one kind into a column, with all their values, with none, or with one that is stale."""
     name, table = "y1", draft.table("y1")
     column, sheet, plain = table.columns[name], table.sheet, draft.plain
     ref = f"{column}{table.rows[0]}:{column}{table.rows[-1]}"
@@ -853,7 +852,7 @@ for _kind in ("plain", "shared", "array", "one array", "what-if"):
 
 
 def settings(draft: Draft, calculation: str) -> None:
-    """Settings of the calculation."""
+    """Set the settings of the calculation."""
     draft.book.calculation = calculation
 
 
@@ -862,7 +861,7 @@ for _calculation in SETTINGS:
 
 
 def changed_since(draft: Draft, name: str) -> None:
-    """A typed number that was changed, the formulas not calculated since."""
+    """Change a typed number without calculating the formulas again."""
     sheet, at = draft.table(name).sheet, draft.cells(name)[0]
     sheet[at] *= 1.3
     mean(draft, BROKEN, (), *(s.name for s in draft.book.sheets))
@@ -876,7 +875,7 @@ for _name in ("x1", "d", "Td"):
 
 
 def wrongly_stored(draft: Draft, name: str, value: Any, every: bool) -> None:
-    """Stored values that are not what the formulas give."""
+    """Store values that are not what the formulas give."""
     sheet = draft.table(name).sheet
     for at in draft.cells(name)[: None if every else 1]:
         sheet[at] = Formula(sheet[at].text, value, sheet[at].attributes)
@@ -890,7 +889,7 @@ for _i, _name in enumerate(("l", "b", "elevation", "H", "x2", "slope")):
 
 
 def length(draft: Draft, kind: str) -> None:
-    """l typed over its formula, by a formula of its own, or missing."""
+    """Type l over its formula, give it a formula of its own, or remove it."""
     table = draft.table("l")
     lengths, bs = draft.system.collimator_length.copy(), draft.system.pinhole_distance
     some = [0] if kind.startswith("one") else draft.tables[0].modules
@@ -914,7 +913,7 @@ for _kind in ("one typed", "every typed", "every own", "one missing"):
 
 
 def derived(draft: Draft, name: str, change: str, head: str, meaning: str) -> None:
-    """A derived column in another unit, which its heading says or not, or with other numbers."""
+    """Write a derived column in another unit, which its heading says or not, or with other numbers."""
     table = draft.table(name)
     for at in draft.cells(name):
         v = table.sheet[at]
@@ -1009,7 +1008,7 @@ NOTES: dict[str, dict[str, Any]] = {
 
 
 def further_sheet(draft: Draft, name: str, kind: str, state: str) -> None:
-    """A sheet more: of something else, or a copy with other numbers, the same, or none."""
+    """Add a sheet: of something else, or a copy with other numbers, the same, or none."""
     table, plain = draft.tables[-1 if "dimensions" in kind else 0], draft.plain
     source, meaning = table.sheet, SAME
     if kind == "notes":
@@ -1064,7 +1063,7 @@ add(many_sheets)
 
 
 def hidden_sheet(draft: Draft, which: int, state: str, twin: str) -> None:
-    """A sheet of the scanner that is hidden, beside one of notes or one like it that is shown."""
+    """Hide a sheet of the scanner, beside one of notes or one like it that is shown."""
     sheet = draft.tables[which].sheet
     shown = Sheet("Notes", {"A1": "see me"})
     if twin:
@@ -1079,8 +1078,8 @@ def hidden_sheet(draft: Draft, which: int, state: str, twin: str) -> None:
 for _state in ("hidden", "veryHidden"):
     for _which in (0, -1):
         add(hidden_sheet, _which, _state, "", second="sheet")
-for _twin in ("MDSL cloud import", "Coordinates new"):
-    add(hidden_sheet, 0, "hidden", _twin, sheets=("Coordinates", "Main"), formulas="")
+for _state, _twin in (("hidden", "MDSL cloud import"), ("veryHidden", "Coordinates new")):
+    add(hidden_sheet, 0, _state, _twin, sheets=("Coordinates", "Main"), formulas="")
 
 
 def hidden_parts(draft: Draft, kind: str) -> None:
@@ -1144,7 +1143,7 @@ STORED_ODDLY: dict[str, tuple[Callable[[list[str]], list[str]], str]] = {
 
 
 def stored_oddly(draft: Draft, kind: str) -> None:
-    """The XML of the first sheet's rows, changed."""
+    """Change the XML of the first sheet's rows."""
     sheet = draft.tables[0].sheet
     sheet.row_order, meaning = STORED_ODDLY[kind]
     mean(draft, meaning, (), sheet.name, "scanner.xlsx")

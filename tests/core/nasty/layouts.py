@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -18,6 +18,7 @@ BIG_CENTERS = np.array([[540.0, 70.5, -92.0], [315.0, 416.0, -96.5], [-164.0, -4
 POSITION, DIMENSIONS = ("x1", "y1", "z1"), ("d", "R", "Ld", "Td")
 TYPED = (*POSITION, *DIMENSIONS, "l")
 DERIVED = ("b", "slope", "H", "x2", "y2", "z2", "range", "azimuth", "elevation")
+DERIVED_AND_LENGTH = (*DERIVED[:2], "l", *DERIVED[2:])
 DESCRIPTIONS = {
     **{f"{axis}1": f"{axis} coordinate value at center of hole" for axis in "xyz"},
     **{f"{axis}2": f"{axis} coordinate value at end of detector" for axis in "xyz"},
@@ -204,13 +205,17 @@ class Draft:
         return get_column_letter(max(split(at)[0] for at in self.tables[0].sheet.cells) + k)
 
 
+def random_centers(rng: np.random.Generator, n: int) -> np.ndarray:
+    """Return random centres of pinholes (n, 3), 450 to 900 mm from the isocentre."""
+    directions = rng.normal(size=(n, 3))
+    return np.round(directions / np.linalg.norm(directions, axis=1)[:, None] * rng.uniform(450, 900, (n, 1)), 3)
+
+
 def system_of(layout: Layout) -> PinholeSystem:
     """Return a random scanner that looks like one in centimetres too."""
     rng = np.random.default_rng(layout.seed)
     M = layout.modules
-    directions = rng.normal(size=(M, 3))
-    distances = rng.uniform(450, 900, (M, 1))
-    centers = np.round(directions / np.linalg.norm(directions, axis=1)[:, None] * distances, 3)
+    centers = random_centers(rng, M)
     ranges = ((2, 6), (100, 200), (60, 120), (5, 30))
     d, R, Ld, Td = (np.resize(np.round(rng.uniform(*r, 1 if layout.once else M), 2), M) for r in ranges)
     numbers = rng.choice(np.arange(1, 10 * M), M, replace=False)
@@ -294,7 +299,7 @@ def _is_plain(layout: Layout, kinds: Sequence[str]) -> bool:
     """Return whether a layout must be understood."""
     usual = layout.style in ("symbols", "descriptions", "both") and layout.second in ("", "sheet") and layout.top < 10
     rows = not layout.once or (layout.once == "row" and "" in layout.labels and layout.second == "sheet")
-    labels = len(set(kinds)) == 1 and kinds[0] in ("numbers", "formulas", "unstored", "")
+    labels = set(kinds) <= set(NUMBERS) or set(kinds) == {""}
     labels = labels and layout.number in ("No.", "Definitions", "Module", "Nr.")
     return bool(
         usual
@@ -368,6 +373,8 @@ USERS = Layout(
         *zip(("range", "azimuth", "elevation", "d", "R", "Ld", "Td"), "UVWPQST", strict=True),
     ),
 )
+PLAIN = replace(USERS, formulas="unstored", columns=tuple(zip(DERIVED_AND_LENGTH, "EFGHIJKLMN", strict=True)))
+"""The same as a library writes it: no stored values, and the columns of each sheet side by side."""
 GEOMETRY = Layout(sheets=("Geometry", ""))
 """One sheet: A number, B x1, C y1, D z1, E d, F R, G Ld, H Td, I l; headings in row 1."""
 

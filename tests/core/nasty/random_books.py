@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 
 from .decorations import ELEMENTS, Element
 from .layouts import OTHER_HEADINGS, PLAIN_FORMS, TYPED, USERS, Draft, Layout, formulas_of, laid_out
-from .sheets import Formula, by_hand, by_openpyxl, by_xlsxwriter
+from .sheets import Formula, by_hand, by_xlsxwriter, openpyxl_workbook
 
 SHEETS = [("Coordinates", "Main"), ("Geometry", "Sheet2"), ("Lage", "Größen"), (" Main ", "COORDINATES")]
 SHEETS += [("a'b", "c d"), ("a" * 31, "b" * 31), ("Main", "Coordinates")]
@@ -65,6 +65,11 @@ class Recipe:
         return ", ".join(words or fields)[:90] or "usual"
 
     @property
+    def group(self) -> str:
+        """The kind of its first decoration."""
+        return self.elements[0].decorate.__name__ if self.elements else "layouts"
+
+    @property
     def fitting(self) -> Layout:
         """The layout as the decorations need it."""
         fields = {field.name for field in dataclasses.fields(Layout)}
@@ -83,7 +88,7 @@ def written(recipe: Recipe, path: Path) -> Draft:
         draft.plain &= not any("form" in kind or kind == "unstored" for kind in draft.layout.labels)
         return draft
     if program == "openpyxl":
-        by_openpyxl(draft.book, path)
+        openpyxl_workbook(draft.book).save(path)
         return draft
     by_hand(draft.book, path)
     if program.endswith("values alone") and not {draft.layout.formulas, *draft.layout.labels} & {"unstored", "zeros"}:
@@ -152,5 +157,5 @@ def every_recipe() -> Iterator[Recipe]:
     """Yield recipes in which every choice of a layout, every program and every decoration occurs alone."""
     for layout, program in zip(dict.fromkeys(VARIED), cycle(PROGRAMS), strict=False):
         yield Recipe(layout, (), program)
-    for element, layout in zip(ELEMENTS, cycle(BASES), strict=False):
-        yield Recipe(layout, (element,))
+    recipes = [Recipe(layout, (element,)) for element, layout in zip(ELEMENTS, cycle(BASES), strict=False)]
+    yield from sorted(recipes, key=lambda recipe: recipe.group)

@@ -15,7 +15,10 @@ from pathlib import Path
 from typing import Any
 from xml.sax.saxutils import escape, quoteattr
 
+from openpyxl.comments import Comment
 from openpyxl.utils import column_index_from_string, get_column_letter
+from openpyxl.workbook import Workbook
+from openpyxl.workbook.defined_name import DefinedName
 
 
 @dataclass(frozen=True)
@@ -334,13 +337,9 @@ def by_xlsxwriter(book: Book, path: Path, **options: Any) -> None:
             workbook.define_name(name, "=" + formula)
 
 
-def by_openpyxl(book: Book, path: Path) -> None:
-    """Write with openpyxl: no formula has a stored value."""
-    import openpyxl
-    from openpyxl.comments import Comment
-    from openpyxl.workbook.defined_name import DefinedName
-
-    workbook = openpyxl.Workbook()
+def openpyxl_workbook(book: Book) -> Workbook:
+    """Return a book as openpyxl's, in which no formula has a stored value."""
+    workbook = Workbook()
     workbook.remove(workbook.active)
     for sheet in book.sheets:
         worksheet = workbook.create_sheet(sheet.name)
@@ -359,4 +358,4 @@ def by_openpyxl(book: Book, path: Path) -> None:
             worksheet.column_dimensions[letters].hidden = True
     for name, formula in book.names.items():
         workbook.defined_names[name] = DefinedName(name, attr_text=formula)
-    workbook.save(path)
+    return workbook

@@ -237,7 +237,6 @@ class Emission(Model):
         return replace(self, hole="rays") if self.hole == "auto" else self
 
     def _set(self, name: str, value: Any) -> None:
-        """Set an attribute of this frozen dataclass."""
         object.__setattr__(self, name, value)
 
     def _set_optics(self) -> None:
@@ -333,7 +332,6 @@ class Emission(Model):
 
     @cached_property
     def _frames(self) -> Floats:
-        """The modules' frames (M, 3, 3), with rows u, v, k."""
         return self.system.frames()
 
     @property
@@ -489,7 +487,6 @@ class Emission(Model):
         return self._optics_of(m).openings(self.system.pinhole_diameter[m], n)
 
     def _optics_of(self, m: int) -> Optics:
-        """Return the optics of module m."""
         return self.optics.of_modules(m, len(self.system))
 
     def _crystal_scale(self, views: Views, m: int) -> float:

@@ -259,7 +259,7 @@ def _end_of_last_grid(path: Path) -> int:
             return number
 
         def skip_texts() -> None:
-            """Skip the texts at the present position."""
+            """Move past three texts at the present position."""
             # Metadata have a name, type and value; a grid has a name, type and instance parent.
             for _ in range(3):
                 file.seek(read_count(_MAX_TEXT), 1)

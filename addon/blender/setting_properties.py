@@ -112,7 +112,7 @@ def check_mark(name: str, word: str, text: str, first_value: Any) -> Any:
         return not (any(value) if isinstance(first_value, tuple) else value)
 
     def set_unset(owner: Any, unset: bool) -> None:
-        """Set the number to 0, which leaves it out, or give it the first value."""
+        """Remove the number, or give it a value."""
         if unset != is_unset(owner):
             setattr(owner, name, zero if unset else first_value)
 

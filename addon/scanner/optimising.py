@@ -32,7 +32,7 @@ def optimize_job(scene: bpy.types.Scene, path: Path) -> jobs.Job:
     recipe, live = read_design_recipe(path), _LiveDesign(scene, path.stem)
 
     def work(progress: Progress) -> Design:
-        """Return the best design, also where the user finishes the search early."""
+        """Search for the best scanner; return the best design also where the user finishes the search early."""
         try:
             return optimize(recipe, stages_of(progress)("designing"), callback=live.store_best)
         except Cancelled as stop:

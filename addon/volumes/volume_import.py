@@ -140,7 +140,7 @@ def _derived_volume_job(
         return states
 
     def finish(result: bpy.types.Object, stored: stored_volumes.StoredVolume) -> str:
-        """Give the new volume the old one's first frame and sequence mode, and return the line to report."""
+        """Make the new volume play its states as the old one does, and return the line to report."""
         result.data.frame_start, result.data.sequence_mode = frame_start, sequence_mode
         return f"Added {result.name!r}: {volumes.values_text(stored)}{note}"
 

@@ -17,37 +17,63 @@ from mphdrr.addon.volumes import volumes
 from mphdrr.core import events
 from mphdrr.core.events.templates import TEMPLATES
 from mphdrr.core.runs.files import read_run
+from mphdrr.core.workbook import read_system
 
-from ..core.small_events import WORKBOOK, small_recipe, with_phantoms
-from .conftest import cancelled, refused, reopened
+from .conftest import WORKBOOK, cancelled, refused, reopened
 
-PHANTOMS = """
+TEXT = f"""
+version = 1
+seed = 3
+[system]
+file = '{WORKBOOK}'
+modules = "1-4"
+[detector]
+rows = 8
+columns = 8
+[truth]
+voxels = 16
+spacing = 6.0
 [[phantoms]]
 kind = "derenzo"
-radius = { from = 30, to = 36 }
-rod_diameters = [10, { from = 8, to = 9 }, 0, 0, 0, 0]
+radius = {{ from = 30, to = 36 }}
+rod_diameters = [10, {{ from = 8, to = 9 }}, 0, 0, 0, 0]
 altered = -2
-activity = { from = 50, to = 100 }
+activity = {{ from = 50, to = 100 }}
 [phantoms.pose]
-position = [{ from = -8, to = 8 }, 0, 5]
+position = [{{ from = -8, to = 8 }}, 0, 5]
 turn = "uniform"
 [[phantoms]]
 kind = "defrise"
 odds = 0.5
-disks = { from = 2, to = 4 }
+disks = {{ from = 2, to = 4 }}
 disk_radius = 30
 spacing_of_disks = 14
+[models.lines]
+kind = "transmission"
+[models.counts]
+kind = "emission"
+time = 100
+hole = "point"
+pixel_points = 1
+tolerance = 1e6
+[augmentation]
+mirror = 0.5
+size = {{ from = 0.9, to = 1.1 }}
+activity = {{ from = 0.5, to = 2 }}
+[splits]
+train = 0.5
+test = 0.5
 """
-AUGMENTATION = "[augmentation]\nmirror = 0.5\nsize = { from = 0.9, to = 1.1 }\nactivity = { from = 0.5, to = 2 }\n"
-TEXT = with_phantoms(PHANTOMS) + AUGMENTATION
 
 
 @pytest.fixture
 def recipe(scene, tmp_path) -> events.EventRecipe:
     """Return the recipe `TEXT`, chosen in the panel with a folder for its set."""
+    path = tmp_path / "small.toml"
+    path.write_text(TEXT)
     settings = scene.mphdrr_events
-    settings.recipe, settings.folder, settings.count = str(tmp_path / "small.toml"), str(tmp_path / "set"), 2
-    return small_recipe(tmp_path, TEXT)
+    settings.recipe, settings.folder, settings.count = str(path), str(tmp_path / "set"), 2
+    return events.read_recipe(path)
 
 
 def first_of(recipe: events.EventRecipe, name: str, mirrored: bool | None = None) -> events.PlannedEvent:
@@ -115,9 +141,16 @@ def test_its_attenuation_and_outline_go_with_it(recipe, scene):
     assert volumes.volume_from_object(child).array.max() > 0.01
 
 
+def with_phantom(path: Path, entry: str) -> str:
+    """Write the recipe with this one phantom into a file, and return its path."""
+    head, tail = TEXT.split("[[phantoms]]", 1)[0], TEXT[TEXT.index("[models.lines]") :]
+    path.write_text(f"{head}[[phantoms]]\n{entry}\n{tail}")
+    return str(path)
+
+
 def test_the_gates_of_a_beating_heart_are_its_frames(scene, tmp_path):
-    small_recipe(tmp_path, with_phantoms('[[phantoms]]\nkind = "torso"\ngates = 2\nwall = { from = 8, to = 12 }'))
-    assert bpy.ops.mphdrr.try_event(recipe=str(tmp_path / "small.toml"), number=5) == {"FINISHED"}
+    path = with_phantom(tmp_path / "torso.toml", 'kind = "torso"\ngates = 2\nwall = { from = 8, to = 12 }')
+    assert bpy.ops.mphdrr.try_event(recipe=path, number=5) == {"FINISHED"}
     item = only_phantom()
     assert item.data.frame_duration == 2 and 8 <= phantoms.settings_of(item).wall <= 12
 
@@ -126,9 +159,10 @@ def test_a_file_of_the_recipe_is_tried_too(recipe, scene, tmp_path):
     bpy.ops.mphdrr.try_event()
     item = only_phantom()
     (tmp_path / "ball.toml").write_text('[[shape]]\nkind = "sphere"\nradius = 20\nactivity = 7.0\n')
-    planned = events.plan(small_recipe(tmp_path, with_phantoms('[[phantoms]]\nfile = "ball.toml"') + AUGMENTATION), 0)
-    assert bpy.ops.mphdrr.try_event(number=0) == {"FINISHED"}
+    path = with_phantom(tmp_path / "file.toml", 'file = "ball.toml"')
+    assert bpy.ops.mphdrr.try_event(recipe=path, number=0) == {"FINISHED"}
     assert phantoms.settings_of(item) is None and "file-1" in scene.mphdrr_events.tried
+    planned = events.plan(events.read_recipe(path), 0)
     assert item.mphdrr_volume.maximum == pytest.approx(7.0 * planned.activity_factor, rel=1e-3)
     bpy.ops.mphdrr.try_event(number=0)
     assert only_phantom() == item
@@ -167,7 +201,7 @@ def test_an_event_is_opened_with_truth_phantom_and_projections(recipe, scene, tm
     item = runs.shown_run(scene)
     np.testing.assert_array_equal(read_run(storage.absolute(item.file)).projections, event.images("lines"))
     assert item.name == f"Event {number} derenzo, lines" and runs.changes(scene) == []
-    assert len(scanner.modules(scanner.active_scanner(scene))) == 8, "the set's, since the scene had none"
+    assert len(scanner.modules(scanner.active_scanner(scene))) == 4, "the set's, since the scene had none"
 
 
 ODD = """[models.odd]
@@ -198,13 +232,12 @@ tolerance = 0.7
 @pytest.mark.parametrize("has_scanner", [pytest.param(False, marks=pytest.mark.long), True])
 def test_an_opened_event_is_current_until_something_is_changed(recipe, scene, tmp_path, has_scanner):
     """Float64 in the recipe, float32 in the scene: the same numbers; 84 degrees are others."""
-    pitch = TEXT.replace("columns = 16", "columns = 16\npitch = 12.345678901234567\nmagnification = 9.87654321")
+    pitch = TEXT.replace("columns = 8", "columns = 8\npitch = 12.345678901234567\nmagnification = 9.87654321")
     (tmp_path / "odd.toml").write_text(pitch.replace("[augmentation]", f"{ODD}[augmentation]"), encoding="utf-8")
-    odd = events.read_recipe(tmp_path / "odd.toml")
-    events.make(odd, tmp_path / "set", 1)
+    events.make(events.read_recipe(tmp_path / "odd.toml"), tmp_path / "set", 1)
     if has_scanner:
-        scanner.build_scanner(scene, events.EventMaker(odd).system)
-    for model in ("lines", "emission", "odd", "path"):
+        scanner.build_scanner(scene, read_system(WORKBOOK)[:4])
+    for model in ("lines", "counts", "odd", "path"):
         bpy.ops.mphdrr.open_event(opened=0, model=model)
         assert runs.changes(scene) == [], model
     scene = reopened(tmp_path / "kept.blend")
@@ -231,9 +264,9 @@ def test_the_next_event_takes_the_place_of_the_one_before(recipe, scene, tmp_pat
     events.make(recipe, tmp_path / "set", 3)
     bpy.ops.mphdrr.open_event(opened=0)
     first, objects = scene.mphdrr_events.truth, set(bpy.data.objects)
-    bpy.ops.mphdrr.open_event(opened=2, model="emission")
+    bpy.ops.mphdrr.open_event(opened=2, model="counts")
     assert set(bpy.data.objects) == objects and scene.mphdrr_events.truth == first
-    assert first.name.startswith("Event 2 ") and runs.shown_run(scene).name.endswith(", emission")
+    assert first.name.startswith("Event 2 ") and runs.shown_run(scene).name.endswith(", counts")
     bpy.ops.mphdrr.try_event(number=1)
     assert only_phantom().visible_get() and not first.visible_get()
     bpy.data.objects.remove(first)
@@ -244,7 +277,7 @@ def test_the_next_event_takes_the_place_of_the_one_before(recipe, scene, tmp_pat
 def test_what_is_wrong_is_said_in_a_line(recipe, scene, tmp_path):
     events.make(recipe, tmp_path / "set", 1)
     refused(bpy.ops.mphdrr.open_event, r"event 7: not in .*which holds 1 event, 0 to 0", opened=7)
-    refused(bpy.ops.mphdrr.open_event, "'blurred': no such model; there are lines, emission", opened=0, model="blurred")
+    refused(bpy.ops.mphdrr.open_event, "'blurred': no such model; there are lines, counts", opened=0, model="blurred")
     Path(scene.mphdrr_events.recipe).write_text(TEXT.replace("radius =", "radios ="))
     refused(bpy.ops.mphdrr.try_event, "derenzo: radios: no such setting")
     scene.mphdrr_events.recipe = scene.mphdrr_events.folder = ""
@@ -255,12 +288,12 @@ def test_what_is_wrong_is_said_in_a_line(recipe, scene, tmp_path):
 def test_notes_say_what_a_recipe_and_a_set_are(recipe, scene, tmp_path):
     settings = scene.mphdrr_events
     note = event_notes.recipe_note(settings.recipe)
-    assert (note.text, note.is_wrong) == ("derenzo, defrise; lines, emission; 16³ voxels of 6 mm", False)
+    assert (note.text, note.is_wrong) == ("derenzo, defrise; lines, counts; 16³ voxels of 6 mm", False)
     assert event_notes.recipe_note("") is None and event_notes.set_note(settings.folder) is None
     events.make(recipe, tmp_path / "set", 2)
     (tmp_path / "set/events/000001.h5").unlink()
     note = event_notes.set_note(settings.folder)
-    assert note.text.startswith("1 of 2 events, ") and note.models == ("lines", "emission")
+    assert note.text.startswith("1 of 2 events, ") and note.models == ("lines", "counts")
     Path(settings.recipe).write_text(TEXT.replace("radius =", "radios ="))
     note = event_notes.recipe_note(settings.recipe)
     assert note.is_wrong and note.text.startswith("phantoms: derenzo: radios: no such setting")

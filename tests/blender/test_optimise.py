@@ -14,13 +14,41 @@ from mphdrr.addon.blender import jobs
 from mphdrr.addon.scanner import optimising, scanner
 from mphdrr.core.cli import main
 
-from ..core import small_design
 from .conftest import assert_same, refused, update
 from .test_jobs import everything
 
 pytest.importorskip("scipy", reason="no scipy")
 
-TEXT = small_design.TEXT.replace("starts = 2\ncoarse_steps = 4", "starts = 1\ncoarse_steps = 3")
+TEXT = """
+version = 1
+
+[generator]
+kind = "ellipse"
+modules = 3
+semi_axes = [150, 140]
+start = 10
+end = 250
+z = [-28, 31]
+pinhole_diameter = 4
+detector_side = 50
+detector_thickness = 8
+roi_radius = 26
+
+[free]
+semi_axes = [[110, 200], [110, 200]]
+z = [[-60, -20], [20, 60]]
+pinhole_diameter = [1, 9]
+
+[[objectives]]
+kind = "detail"
+size = 8
+points = 5
+
+[search]
+starts = 1
+coarse_steps = 3
+steps = 1
+"""
 
 
 @pytest.fixture(scope="module")

@@ -22,7 +22,7 @@ _TOP = Path(__file__).parents[1]
 
 @dataclass(frozen=True)
 class WorkStage:
-    """Stage of the work, with a line on what the scene has of it: "" for nothing."""
+    """Stage of the work, with a note on what the scene holds for it, "" if it holds nothing."""
 
     name: str
     note: str = ""

@@ -25,6 +25,7 @@ def public(package: str, extra: str = "") -> tuple[Callable[[str], Any], Callabl
     modules = {name.name: node.module for node in block.body if isinstance(node, ast.ImportFrom) for name in node.names}
 
     def import_attribute(name: str) -> Any:
+        """Import the module of an attribute at its first use, and return the attribute."""
         if name not in modules:
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
         with needing(extra) if extra else contextlib.nullcontext():

@@ -89,6 +89,7 @@ class MPHDRR_OT_flood_efficiency(jobs.ExportJob, bpy.types.Operator):
         order, scene_uid = self.order, context.scene.session_uid
 
         def finish(lines: list[str]) -> str:
+            """Set the written file as the modules' efficiencies, and return the lines to report."""
             scene = jobs.require_scene(scene_uid, "the efficiencies are")
             scene.mphdrr_projections.efficiency_of_modules = storage.stored_path(path)
             return " ".join(lines)
@@ -114,11 +115,13 @@ class MPHDRR_OT_compare_runs(jobs.JobOperator, bpy.types.Operator):
         names = f"{minuend.name!r} minus {subtrahend.name!r}"
 
         def work(progress: Progress) -> Any:
+            """Return the difference of the two runs, its sheet and the modules' numbers."""
             first, second = map(read_run, paths)
             result = difference(first, second)
             return result, difference_sheet(first, result), first.system.numbers.tolist()
 
         def finish(results: Any) -> str:
+            """Show the difference, and return the line to report."""
             result, sheet, numbers = results
             text = f"{names}: {result.text}"
             images.show_below(images.store_difference(sheet, numbers, result.unit, text), bpy.context)

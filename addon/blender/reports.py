@@ -28,6 +28,7 @@ def in_window(text: object) -> str:
     """
 
     def labelled(match: re.Match[str]) -> str:
+        """Return the label in Blender of the option that was matched."""
         setting, word = SETTINGS[match[1]], match[2]
         label = setting.label.partition(" (")[0]
         return label if word is None else f"{label} {setting.words.get(word, (word,))[0]}"

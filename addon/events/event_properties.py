@@ -47,7 +47,7 @@ OPENED = number_property("Number of the event to open, from 0")
 
 
 class EventProperties(bpy.types.PropertyGroup):
-    """State of the Event Set panel."""
+    """Properties of the Event Set panel: recipe, folder, and the phantom on which events are tried."""
 
     recipe: recipe_property(_propose_folder)
     number: NEXT

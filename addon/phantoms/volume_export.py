@@ -32,6 +32,7 @@ def export_job(item: bpy.types.Object, path: Path) -> jobs.Job:
         provenance |= {"frame": bpy.context.scene.frame_current, "state": volumes.state_text(item)}
 
     def work(progress: Progress) -> None:
+        """Read the voxels, and write them to the chosen file."""
         stages_of(progress)("reading the voxels")
         volume = read()
         stages_of(progress)("writing the file")

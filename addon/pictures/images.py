@@ -371,6 +371,7 @@ def _fit(window: bpy.types.Window, area: bpy.types.Area) -> None:
     area.tag_redraw()
 
     def fit() -> None:  # called after the redraw, when a new editor knows its size
+        """Fit the image to the editor."""
         try:
             with bpy.context.temp_override(window=window, area=area, region=region):
                 size, free = tuple(area.spaces.active.image.size), _picture_size(area)

@@ -149,6 +149,7 @@ def _visibility(scene: bpy.types.Scene) -> list[tuple[bpy.types.Object, bool]]:
     ring = None if active is None else active.mphdrr_module.ring
 
     def is_shown(camera: bpy.types.Object | None) -> bool:
+        """Return whether the plane of a module's camera is to be seen."""
         if camera is None or camera.hide_viewport or mode == "NONE":
             return False
         return mode == "ALL" or camera == active or (mode == "RING" and camera.mphdrr_module.ring == ring)

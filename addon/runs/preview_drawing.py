@@ -40,6 +40,7 @@ def start(session: Any) -> Callable[[], None]:
     ]
 
     def end() -> None:
+        """Remove the drawing from the 3D views, and free its textures."""
         for handle in handles:
             view.draw_handler_remove(handle, "WINDOW")
         _textures.cache_clear()
@@ -93,6 +94,7 @@ def _draw_box(session: Any) -> None:
     preview, width, height = session.preview, _WIDTH * unit, 0.0
 
     def fits(text: str) -> bool:
+        """Return whether a text is at most as wide as the box."""
         return windows.text_width(text, size) <= _WIDTH * unit
 
     lines = [piece for line in session.lines for piece in wrap_text(line, fits)]

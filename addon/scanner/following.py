@@ -202,6 +202,7 @@ def _reshape(
     """Reshape the outdated parts of modules, or show at a module why its parts cannot be built."""
 
     def build(group: list[_Outdated]) -> Sequence[ModulePart]:
+        """Return the parts of the modules of a group as they are to be."""
         subsystem = system[np.array([m for m, _, _ in group])] if len(group) < len(system) else system
         return subsystem.parts(pinholes.construction(scanner, type(system)))
 

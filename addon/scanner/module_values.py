@@ -166,6 +166,7 @@ def read_in_groups(
     """Yield groups of module indices with the modules read at their placement, or the error that refuses a module."""
 
     def read(indices: list[int]) -> Scanner:
+        """Return the scanner of the modules with these indices."""
         return _read_at(kind, [cameras_[m] for m in indices], Placement(*map(itemgetter(indices), placement)))
 
     return make_groups(list(range(len(cameras_))), read)
@@ -225,6 +226,7 @@ def _write_pose_attributes(
     """Write the attributes of modules at their poses into `rows`, one by one where that is not possible together."""
 
     def read_attributes(indices: list[int]) -> Mapping[str, NDArray[Any]]:
+        """Return the attributes of poses of the modules with these indices, by name."""
         return as_imported(kind, tuple(cameras_[m].mphdrr_module.exact for m in indices)).attributes_at(poses[indices])
 
     for group, attributes in make_groups(indices, read_attributes):

@@ -77,6 +77,7 @@ def write_states(states: Sequence[Volume], folder: Path, provenance: dict[str, A
     smoke_above = volume_materials.default_range(states[0].quantity, low, 1.0)[0] if low < 0 else None
 
     def write(stem: str, states: Sequence[Volume], provenance: Any, smoke_above: float | None) -> Path:
+        """Write the states to .vdb files whose names begin with `stem`, and return the first path."""
         paths = [folder / f"{stem}{f'_{k:04d}' if len(states) > 1 else ''}.vdb" for k in range(1, len(states) + 1)]
         for state, path in zip(states, paths, strict=True):
             if not path.exists():

@@ -248,15 +248,18 @@ def _end_of_last_grid(path: Path) -> int:
     with open(path, "rb") as file:
 
         def read_numbers(types: str) -> tuple[int, ...]:
+            """Read numbers of the given `struct` types."""
             return struct.unpack(f"<{types}", file.read(struct.calcsize(f"<{types}")))
 
         def read_count(limit: int) -> int:
+            """Read a number of items; refuse one above `limit`."""
             (number,) = read_numbers("I")
             if number > limit:
                 raise struct.error("another layout")
             return number
 
         def skip_texts() -> None:
+            """Move past three texts at the present position."""
             # Metadata have a name, type and value; a grid has a name, type and instance parent.
             for _ in range(3):
                 file.seek(read_count(_MAX_TEXT), 1)

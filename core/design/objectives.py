@@ -102,7 +102,7 @@ class Detail(_PointObjective):
     """Shape of the hole's blur."""
 
     def _merits(self, modules: Modules, optics: Any) -> Floats:
-        """Return ``g MTF |MTF|`` (P, M)."""
+        """Return ``g MTF |MTF|`` (P, M): sensitivity g and modulation transfer of each point in each module."""
         special = scipy_module("special")
         hole_fwhm = resolution(modules, self.points, optics=optics, intrinsic_fwhm=0.0)
         gaussian_fwhm_squared = resolution(modules, self.points, optics=optics) ** 2

@@ -42,6 +42,7 @@ def _stored_array(name: str, description: str) -> Any:
     """Return a property of `Event` that reads an array of its file, float64, with this description as docstring."""
 
     def read(event: Event) -> Floats:
+        """Return the array that the event's file stores under the property's name."""
         with event.opened() as file:
             return np.asarray(hdf5.read_numbers(event._dataset(file, name)), np.float64)
 

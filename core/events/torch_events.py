@@ -72,6 +72,7 @@ class TorchEvents(Dataset):
             """Return an allocator that gives views of the batch's arrays at a position in the batch."""
 
             def allocate(name: str, shape: Sequence[int]) -> torch.Tensor:
+                """Return the item's tensor for a field within the batch's array."""
                 if name not in batch:
                     batch[name] = _allocate_zeros((len(indices), *shape))
                 return batch[name][position]

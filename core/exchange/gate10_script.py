@@ -135,6 +135,7 @@ def add_digitizer(simulation: Any, units: Any, detector: dict[str, Any], crystal
     chain = [hits]
 
     def add(kind: str, name: str) -> Any:
+        """Add an actor of this kind to the chain, after the one before, and return it."""
         actor = simulation.add_actor(kind, f"{crystal}_{name}")
         actor.input_digi_collection = chain[-1].name
         chain.append(actor)

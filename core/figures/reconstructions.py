@@ -188,7 +188,10 @@ def draw_objective(
 
 
 def _scale_bar(page: Page, scale: float, extent: float, left: float, bottom: float) -> None:
-    """Draw a bar of a round length, about a quarter of a slice, at its lower left corner."""
+    """Draw a bar of a round length, about a quarter of a slice, at the slice's lower left corner.
+
+    `scale` is in pixels per mm, `extent` the slice's width, mm.
+    """
     length = [step for step in (1, 2, 5, 10, 20, 50, 100, 200, 500) if step <= max(1.0, extent / 4)][-1]
     page.line([(left, bottom), (left + length * scale, bottom)], "#ffffff", 0.16 * page.em)
     page.text(f"{length} mm", left, bottom - 0.4 * page.em, 0.85 * page.em, "#ffffff")

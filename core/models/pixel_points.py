@@ -60,6 +60,7 @@ def _generator(n: int) -> int:
     i = np.arange(1, n)
 
     def merit(g: int) -> int:
+        """Return the smallest product of a point's cyclic row and column distances, cells, from the first point."""
         row = i * g % n
         return int((np.minimum(i, n - i) * np.minimum(row, n - row)).min())
 

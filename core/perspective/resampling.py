@@ -213,7 +213,10 @@ class _LatticeMap(LinearOperator):
 
     @abstractmethod
     def forward(self, x: Array, progress: Progress | None) -> Array:
-        """Return the map of an array of float32 or float64 on the source lattice."""
+        """Return this map applied to `x` on the source lattice: an array on the target lattice.
+
+        Both are of one type, float32 or float64.
+        """
 
     @abstractmethod
     def adjoint(self, y: Array, progress: Progress | None) -> Array:

@@ -85,6 +85,7 @@ def module_coefficients(
         photons = photons * (system.pinhole_diameter.mean() + widening)
 
     def stopping_mu(material: str, thickness: float, name: str) -> float:
+        """Return the coefficient, 1/mm, with which one energy is stopped as the lines are over `thickness`, mm."""
         mu = _line_coefficients(material, lines, name)
         passed = np.average(np.exp((mu.min() - mu) * thickness), weights=photons)
         return float(mu.min() - np.log(passed) / thickness)

@@ -197,12 +197,12 @@ class NodeKernelGradient:
         self._d_totals = np.array(d_totals)
 
     def value_by_edges(self, zone: DepthZone) -> float:
-        """Return the form, up to a constant, for a zone that differs in the voxel's edges alone."""
+        """Return the linear form, up to a constant, for a zone that differs in the voxel's edges alone."""
         spectra = KernelSpectra(zone.kernel_shape, zone.cells_per_pixel, self._half)
         return float(np.vdot(self._d_pixel_and_voxel, spectra.pixel_and_voxel))
 
     def value(self, zone: DepthZone, effects: DirectionalEffects) -> float:
-        """Return the form, up to a constant, for another zone and other effects."""
+        """Return the linear form, which changes as the loss does, up to a constant, for another zone and other effects."""
         spectra = ObliqueSpectra(zone, zone_nodes(zone, effects), self._half)
         total = self._d_totals @ spectra.totals + self._d_curvature @ spectra.shape.curvature
         total += self._d_smallest_tap @ spectra.smallest_tap.ravel()

@@ -112,7 +112,7 @@ class Setting:
         return tuple(map(self.checked_one, values))
 
     def _checked_of_modules(self, value: Any) -> Any:
-        """Return the checked number of all modules, or a tuple of those of each; a text may list them."""
+        """Return the checked number for all modules, or a tuple of one number per module; a text may list them."""
         if isinstance(value, str) and not self.names_file(value):
             with suppress(ValueError):
                 value = list(map(float, value.replace(",", " ").split()))

@@ -36,7 +36,10 @@ class FormulaContext:
 
 
 def calculate(formula: str, context: FormulaContext) -> float | str | bool | CellError:
-    """Return the value that a spreadsheet shows for `formula`, which begins with "="; raise `NotComputable` if unknown."""
+    """Return the value that a spreadsheet shows for `formula`, which begins with "=".
+
+    Raise `NotComputable` for a formula that this package cannot compute.
+    """
     try:
         value = _to_scalar(FormulaParser(formula, context).value())
     except _ErrorValue as error:

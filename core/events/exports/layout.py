@@ -126,11 +126,14 @@ class ExportLayout:
         return {}
 
     def parts(self, rows: list[Row]) -> list[ExportPart]:
-        """Return the parts in the order of writing; by default one for each event."""
+        """Return the parts of the export in the order of writing, by default one for each event.
+
+        A part is written at once: it consists of files, and names the events in them.
+        """
         return [ExportPart(self.files(row), (row["i"],)) for row in rows]
 
     def write(self, part: ExportPart, rows: list[Row], folder: Path, report_event: Callable[[], None]) -> None:
-        """Write a part into a folder; call `report_event` after each event."""
+        """Write the files of a part of the export into a folder; call `report_event` after each event."""
         for i in part.events:
             for name, content in self.contents(rows[i], self.selection.events[i]):
                 write_bytes(folder / name, content)

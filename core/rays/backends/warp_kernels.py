@@ -138,6 +138,7 @@ def _cross(w: Walk, shape: wp.vec3i, end: wp.float64):
 
 @wp.func
 def _shape(volume: _Volume):
+    """Return the shape of a volume as a vector of integers."""
     return wp.vec3i(volume.shape[0], volume.shape[1], volume.shape[2])
 
 

@@ -49,7 +49,20 @@ def remove_objects(items: Sequence[bpy.types.Object]) -> None:
     """Remove objects, and their meshes or cameras if nothing else uses these."""
     datablocks = {item.data for item in items}
     bpy.data.batch_remove(list(items))
+    update_hidden_scenes()
     remove_unused(datablocks)
+
+
+def update_hidden_scenes() -> None:
+    """Bring the scenes that no window shows up to date after objects were removed.
+
+    Blender does so only when it shows them, but looks through their objects once a minute (`DRW_cache_free_old_batches`),
+    and would crash on removed ones.
+    """
+    shown = {window.scene for window in bpy.context.window_manager.windows}
+    for layer in [layer for scene in bpy.data.scenes if scene not in shown for layer in scene.view_layers]:
+        if layer.depsgraph is not None:
+            layer.update()
 
 
 def remove_unused(datablocks: Iterable[bpy.types.ID | None]) -> None:

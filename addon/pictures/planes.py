@@ -53,8 +53,7 @@ def show(scene: bpy.types.Scene, run: ProjectionRun, collection: bpy.types.Colle
         plane.data, plane[_KEY] = picture, field.tolist()
         _set_background(camera.data, field, picture)
         shown_planes.append(plane)
-    for plane in old.values():
-        _remove(plane)
+    _remove(list(old.values()))
     update(scene)
     return shown_planes
 
@@ -66,17 +65,16 @@ def planes(scene: bpy.types.Scene) -> list[bpy.types.Object]:
 
 def remove(scene: bpy.types.Scene, modules: list[bpy.types.Object] | None = None) -> None:
     """Remove the planes and the backgrounds of modules, given as cameras, or of all."""
-    for plane in planes(scene):
-        if modules is None or plane.parent in modules:
-            _remove(plane)
+    _remove([plane for plane in planes(scene) if modules is None or plane.parent in modules])
     objects.remove_empty_collections(scene, ids.PLANES)
 
 
-def _remove(plane: bpy.types.Object) -> None:
-    """Remove a plane and its background."""
-    if plane.parent is not None:
-        _remove_background(plane.parent.data, plane.data)
-    bpy.data.objects.remove(plane)
+def _remove(unwanted: list[bpy.types.Object]) -> None:
+    """Remove planes and their backgrounds."""
+    for plane in unwanted:
+        if plane.parent is not None:
+            _remove_background(plane.parent.data, plane.data)
+    objects.remove_objects(unwanted)
 
 
 def update(scene: bpy.types.Scene) -> None:

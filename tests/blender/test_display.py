@@ -242,12 +242,16 @@ def test_backgrounds_are_as_large_as_their_camera_sees_them(projected, scene):
 
 def test_planes_of_another_scene_never_show_this_ones_run(projected, scene, ring_system):
     projected()
+    evaluated = scene.view_layers[0].depsgraph
+    assert sum(datablock.name.startswith("Projection") for datablock in evaluated.ids) >= 8
     other = bpy.data.scenes.new("Other")
     bpy.context.window.scene = other
     scanner.build_scanner(other, ring_system, "Other Ring")
     volumes.add_volume(Volume(np.ones((2, 2, 2), np.float32), Grid.centered(2, 2.0)), "Other Point")
     assert bpy.ops.mphdrr.render_projections(width=8, height=8) == {"FINISHED"}
     assert len(planes.planes(other)) == 8 and not planes.planes(scene)
+    names = [item.name for item in evaluated.ids if item.id_type == "OBJECT"]
+    assert names and not any(name.startswith("Projection") for name in names), "Blender's drawing would crash on them"
     assert images.belong_to(other) and not images.belong_to(scene)
     assert not any(c.data.background_images for c in scanner.modules(scanner.active_scanner(scene)))
     assert rendering.remove_run(scene, 0) and ids.MOSAIC in bpy.data.images, "the images are not of this run"

@@ -8,22 +8,23 @@ import math
 import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from datetime import date
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from ..arrays import Array, Floats
-from ..errors import InputError, reading
+from ..errors import InputError, reading, warn
 from ..files import AnyPath, require_file
 from ..hdf5 import datasets, opened, read_numbers
-from ..memory import require
 from ..progress import Progress, tell
 from ..recording import recorded_warnings
-from ..validation import one_of, shape_text, whole_shape
+from ..validation import one_of, whole_shape
 from ..volumes.formats import metaimage, numpy_files
-from ..volumes.formats.dicom import TOMOGRAMS, decode_pixels, image_kind, is_dicom, require_grey
+from ..volumes.formats.dicom import is_dicom
+from . import interfile, nuclear_medicine
+from .frame_facts import FileFrames, file_numbers, require_memory
+from .stated_times import aligned_starts
 
 RAW_TYPES = ("uint8", "int8", "uint16", "int16", "uint32", "int32", "uint64", "int64", "float32", "float64")
 """Types of the numbers in raw files."""
@@ -130,10 +131,13 @@ def read_counts(
         tell(progress, number, len(paths))
     counts = counts_of_files[0] if len(counts_of_files) == 1 else np.concatenate(counts_of_files).view(Counts)
     counts.about = np.concatenate([file_counts.about for file_counts in counts_of_files])
-    starts = counts.about[:, 4]  # as read, from the beginning of the day or of an era
-    starts -= np.min(starts, initial=np.inf, where=np.isfinite(starts))
+    names = [file.name for file in paths]
+    starts, assumption = aligned_starts([file_counts.about[:, 4] for file_counts in counts_of_files], names)
+    if assumption:
+        warn(assumption)
+    counts.about[:, 4] = starts - np.min(starts, initial=np.inf, where=np.isfinite(starts))
     counts.kind = ", ".join(sorted({file_counts.kind for file_counts in counts_of_files} - {""}))
-    counts.name = ", ".join([*(file.name for file in paths[:3]), *(["…"] if len(paths) > 3 else [])])
+    counts.name = ", ".join([*names[:3], *(["…"] if len(names) > 3 else [])])
     return counts
 
 
@@ -143,46 +147,38 @@ def _read_file(path: Path, layout: CountsLayout) -> Counts:
     ending = path.suffix.lower()
     with reading(path, ending or "counts"):
         if layout.is_raw:
-            return _checked_frames(_read_raw(path, layout))
+            return _checked_frames(FileFrames(_read_raw(path, layout)))
         if layout.dataset is not None and ending not in (".npz", ".h5", ".hdf5"):
             raise InputError("dataset (--dataset) names an array in .npz and .h5; this file has no names")
-        return _reader(path, ending)(path, layout)
+        return _checked_frames(_reader(path, ending)(path, layout))
 
 
-def _reader(path: Path, ending: str) -> Callable[[Path, CountsLayout], Counts]:
+def _reader(path: Path, ending: str) -> Callable[[Path, CountsLayout], FileFrames]:
     """Return the function that reads a file with this ending, in lower case."""
     if ending in _READERS:
         return _READERS[ending]
-    if is_dicom(path):
-        return _read_dicom
+    for is_of_format, reader in ((is_dicom, nuclear_medicine.read), (interfile.begins, interfile.read)):
+        if is_of_format(path):
+            return lambda path, layout: reader(path)
     header = path.with_suffix(".hdr")
     beside = f"its header {header.name}, which is beside it, or " if header.is_file() else ""
     raw = "of raw numbers say the shape (--raw-shape FRAMES ROWS COLUMNS) and the type (--raw-type uint16)"
     raise InputError(f"expected {beside}a name ending in {', '.join(COUNTS_FORMATS)}; {raw}")
 
 
-def _checked_frames(array: Array, kind: str = "", **facts: Sequence[float]) -> Counts:
-    """Return an array as frames (frames, rows, columns) with the `facts` of its file; raise `InputError` for another shape.
-
-    Facts are `time` (s), `pixel` (sizes along a row and down the columns, mm), energy `window` (numbers) with `low` and
-    `high` energies (keV), and `start` (s after any moment). Fewer values than frames are those of equal blocks of frames.
-    """
-    array = array[None] if array.ndim == 2 else array
+def _checked_frames(frames: FileFrames) -> Counts:
+    """Return frames (frames, rows, columns) with the facts of their file; raise `InputError` for another shape."""
+    array = frames.array[None] if frames.array.ndim == 2 else frames.array
     if array.ndim != 3 or not array.size:
         raise InputError(f"expected (frames, rows, columns), got shape {' x '.join(map(str, array.shape)) or '()'}")
     if array.dtype.kind not in "fiu":
         raise InputError(f"expected whole or real numbers, found {array.dtype}")
     counts = array.view(Counts)
-    counts.kind, counts.about[:, 1:3] = kind, facts.get("pixel", math.nan)
+    counts.kind, counts.about[:, 1:3] = frames.kind, frames.facts.get("pixel", math.nan)
     for column, name in ((0, "time"), (3, "window"), (4, "start"), (5, "low"), (6, "high")):
-        values = np.array(facts.get(name) or [math.nan])
+        values = np.array(frames.facts.get(name) or [math.nan])
         counts.about[:, column] = values[np.arange(len(array)) * len(values) // len(array)]
     return counts
-
-
-def _require_memory(shape: Sequence[int], itemsize: int) -> None:
-    """Raise `InputError` unless there is memory for the numbers, their float32 images, and masks for the checks."""
-    require((itemsize + 9.0) * math.prod(map(int, shape)), f"counts of {shape_text(tuple(shape))}")
 
 
 def _read_raw(path: Path, layout: CountsLayout) -> Array:
@@ -192,27 +188,16 @@ def _read_raw(path: Path, layout: CountsLayout) -> Array:
         raise InputError(f"raw numbers need their {shape if layout.shape is None else kind}")
     one_of(layout.type, RAW_TYPES, "raw type")
     type_ = np.dtype(layout.type).newbyteorder(">" if layout.big_endian else "<")
-    return _file_numbers(path, type_, whole_shape(layout.shape, "raw shape (--raw-shape)", 3))
+    return file_numbers(path, type_, whole_shape(layout.shape, "raw shape (--raw-shape)", 3))
 
 
-def _file_numbers(path: Path, kind: np.dtype[Any], shape: tuple[int, ...], skip: int = 0) -> Array:
-    """Return all numbers of a file after its first `skip` bytes."""
-    needed, size = skip + kind.itemsize * math.prod(shape), path.stat().st_size
-    if needed != size:
-        behind = f" behind {skip} bytes" if skip else ""
-        expected = f"{shape_text(shape)} numbers of {kind.itemsize} bytes{behind}"
-        raise InputError(f"expected {needed} bytes ({expected}), {path.name} has {size}")
-    _require_memory(shape, kind.itemsize)
-    return np.fromfile(path, kind, offset=skip).reshape(shape)
-
-
-def _read_numpy(path: Path, layout: CountsLayout) -> Counts:
+def _read_numpy(path: Path, layout: CountsLayout) -> FileFrames:
     """Return the frames of a .npy or .npz file."""
     arrays = numpy_files.load(path)
-    return _checked_frames(arrays["" if path.suffix.lower() == ".npy" else _array_name(arrays, layout)])
+    return FileFrames(arrays["" if path.suffix.lower() == ".npy" else _array_name(arrays, layout)])
 
 
-def _read_hdf5(path: Path, layout: CountsLayout) -> Counts:
+def _read_hdf5(path: Path, layout: CountsLayout) -> FileFrames:
     """Return the frames of an HDF5 file."""
     import h5py
 
@@ -221,8 +206,8 @@ def _read_hdf5(path: Path, layout: CountsLayout) -> Counts:
         if layout.dataset is not None and isinstance(file.get(layout.dataset), h5py.Dataset):
             arrays[layout.dataset.strip("/")] = file[layout.dataset]  # `datasets` has one of an array's names
         dataset = arrays[_array_name(arrays, layout)]
-        _require_memory(dataset.shape, dataset.dtype.itemsize)
-        return _checked_frames(read_numbers(dataset))
+        require_memory(dataset.shape, dataset.dtype.itemsize)
+        return FileFrames(read_numbers(dataset))
 
 
 def _array_name(arrays: dict[str, Any], layout: CountsLayout) -> str:
@@ -239,187 +224,32 @@ def _array_name(arrays: dict[str, Any], layout: CountsLayout) -> str:
     return three_axes[0]
 
 
-def _read_metaimage(path: Path, layout: CountsLayout) -> Counts:
+def _read_metaimage(path: Path, layout: CountsLayout) -> FileFrames:
     """Return the frames of a MetaImage file as GATE 10 writes projections: x along a row, y down the rows, a frame per z."""
     with recorded_warnings() as orientation_warnings:  # the user gives the orientation anyway
         contents = metaimage.read(path)
     affine = np.full((4, 4), math.nan) if contents.affine is None or orientation_warnings else contents.affine
     pixel = np.linalg.norm(affine[:3, :2], axis=0).tolist()
-    return _checked_frames(np.ascontiguousarray(contents.array.transpose(2, 1, 0)), pixel=pixel)
+    return FileFrames(np.ascontiguousarray(contents.array.transpose(2, 1, 0)), facts={"pixel": pixel})
 
 
-def _read_interfile(path: Path, layout: CountsLayout) -> Counts:
-    """Return the frames of an Interfile 3.3 header and the file of numbers that it names, as GATE 9 writes projections.
+def differs(recorded: float, expected: float, is_rounded: bool = False) -> bool:
+    """Return whether a length or time in a file differs from `expected` by more than rounding; False for NaN in the file.
 
-    Reference: A. Todd-Pokropek, T. D. Cradduck, F. Deconinck, "A file format for the exchange of nuclear medicine image
-    data: a specification of Interfile version 3.3", Nuclear Medicine Communications 13 (1992) 673-699.
+    A number that `is_rounded` may differ by half a unit of its last digit, up to 1 %: 0.78 is 0.78125.
     """
-    header = _interfile_header(path)
-
-    def text(key: str, default: str = "") -> str:
-        """Return the first value of a key as a text."""
-        return header.get(key, [default])[0]
-
-    def number(key: str, default: float | None = None) -> float:
-        """Return the first value of a key as a finite number; raise `InputError` if it is none."""
-        text_value = text(key, "" if default is None else str(default))
-        try:
-            value = float(text_value)
-        except ValueError:
-            value = math.nan
-        if not math.isfinite(value):
-            raise InputError(f"{key} := {text_value}: expected a number" if text_value else f"it has no {key!r}")
-        return value
-
-    columns, rows = (int(number(f"matrix size [{i}]")) for i in (1, 2))
-    n_bytes, form = int(number("number of bytes per pixel")), text("number format", "nothing").lower()
-    letter = {"unsigned integer": "u", "signed integer": "i"}.get(form, "f" if form.endswith("float") else "")
-    if letter + str(n_bytes) not in ("u1", "u2", "u4", "u8", "i1", "i2", "i4", "i8", "f4", "f8"):
-        raise InputError(f"number format {form} of {n_bytes} bytes: expected integers, or floats of 4 or 8 bytes")
-    byte_order = text("imagedata byte order").upper()
-    if n_bytes > 1 and byte_order not in ("LITTLEENDIAN", "BIGENDIAN"):
-        raise InputError(f"imagedata byte order {byte_order or 'missing'}: expected LITTLEENDIAN or BIGENDIAN")
-    number_type = np.dtype((">" if byte_order == "BIGENDIAN" else "<") + letter + str(n_bytes))
-    data_path, frame_size = _interfile_data(path, text("name of data file")), rows * columns * n_bytes
-    offset = int(number("data offset in bytes", 2048 * number("data starting block", 0)))
-    n_fitting = (data_path.stat().st_size - offset) // frame_size if frame_size else 0
-    n_frames = int(number("total number of images", n_fitting))
-    keys = (f"{name} (sec)" for name in ("time per projection", "image duration", "study duration"))
-    times = next((list(map(float, header[key])) for key in keys if any(header.get(key, ()))), [])
-    starts = [float(start) for start in header.get("image relative start time (sec)", ()) if start]
-    starts = starts or [_seconds_of_day(start) for start in header.get("image start time", ()) if start]
-    n_windows = int(number("number of energy windows", 1))
-    pixel_size = [float(text(f"scaling factor (mm/pixel) [{i}]", "nan")) for i in (1, 2)]
-    content = f"{n_windows} energy windows" if n_windows > 1 else ""
-    frames = _file_numbers(data_path, number_type, (n_frames, rows, columns), offset)
-    limits: Any = {"window": range(1, n_windows + 1)}
-    for name, word in (("low", "lower"), ("high", "upper")):
-        limits[name] = [float(text(f"energy window {word} level [{i}]", "nan")) for i in limits["window"]]
-    return _checked_frames(frames, content, time=times, pixel=pixel_size, start=starts, **limits)
+    decimals = f"{recorded:.9g}".partition(".")[2]
+    rounding = min(0.5 * 0.1 ** len(decimals), 0.01 * abs(expected)) if is_rounded else 0.0
+    return not (math.isnan(recorded) or math.isclose(recorded, expected, rel_tol=_SAME_SIZE, abs_tol=rounding))
 
 
-def _seconds_of_day(text: str) -> float:
-    """Return the seconds since midnight of a time such as 14:05:30, or 140530.25 in DICOM."""
-    digits = text.replace(":", "")
-    return 3600.0 * int(digits[:2]) + 60.0 * int(digits[2:4] or 0) + float(digits[4:] or 0)
-
-
-def _interfile_header(path: Path) -> dict[str, list[str]]:
-    """Return the values of a header by its keys, in lower case; a repeated key has several."""
-    lines = path.read_bytes()[: 1 << 20].decode("latin-1").splitlines()
-    if not lines or not lines[0].lstrip("!").strip().upper().startswith("INTERFILE"):
-        raise InputError("not an Interfile header: expected !INTERFILE in the first line")
-    header: dict[str, list[str]] = {}
-    for line in lines:
-        key, assigned, value = line.partition(":=")
-        if assigned and not line.lstrip().startswith(";"):
-            key = " ".join(key.strip().lstrip("!").lower().replace("[", " [").split())
-            header.setdefault(key, []).append(value.strip())
-    return header
-
-
-def _interfile_data(path: Path, name: str) -> Path:
-    """Return the file of numbers: at the header's path, or beside the header, since both may have been moved together."""
-    for candidate in (path.parent / name, path.parent / Path(name.replace("\\", "/")).name):
-        if name and candidate.exists():
-            return require_file(candidate)
-    raise InputError(f"its numbers are in {name or 'no file that it names'}, which is not beside it")
-
-
-def _read_dicom(path: Path, layout: CountsLayout) -> Counts:
-    """Return the frames of a nuclear medicine image (DICOM part 3, C.8.4.8): planar images or projections."""
-    import pydicom
-
-    dataset = pydicom.dcmread(path)
-    if (modality := dataset.get("Modality")) != "NM":
-        raise InputError(f"modality {modality or 'missing'}: expected nuclear medicine (NM) with a frame a module")
-    if image_kind(dataset) in TOMOGRAMS or "SliceVector" in dataset:
-        raise InputError("it holds a reconstructed tomogram; expected a frame a module")
-    require_grey(dataset)
-    shape = int(dataset.get("NumberOfFrames") or 1), int(dataset.Rows), int(dataset.Columns)
-    _require_memory(shape, 4)
-    frames = decode_pixels(dataset).reshape(shape)
-    slope, intercept = float(dataset.get("RescaleSlope") or 1), float(dataset.get("RescaleIntercept") or 0)
-    if (slope, intercept) != (1.0, 0.0):
-        frames = frames * slope + intercept
-    vector_sizes = {name: int(dataset.get(f"NumberOf{name.replace(' ', '')}s") or 1) for name in _VECTORS}
-    content = ", ".join(f"{n} {name.lower()}s" for name, n in vector_sizes.items() if n > 1)
-    pixel = [float(size) for size in dataset.get("PixelSpacing") or (math.nan, math.nan)][::-1]
-    windows = _frame_parts(dataset, "Energy Window", vector_sizes["Energy Window"])
-    low, high = ([_window_limit(dataset, number, word) for number in windows] for word in ("Lower", "Upper"))
-    times, starts = _frame_durations(dataset), _frame_starts(dataset, len(frames))
-    return _checked_frames(frames, content, time=times, pixel=pixel, window=windows, start=starts, low=low, high=high)
-
-
-_VECTORS = ("Energy Window", "Detector", "Phase", "Rotation", "RR Interval", "Time Slot")
-"""Properties of frames of which a nuclear medicine image may have several values."""
-
-
-def _frame_durations(data: Any) -> list[float]:
-    """Return the exposures of frames, s: those of each frame's rotation or phase, or one for all frames."""
-    for name in ("Rotation", "Phase"):
-        durations = [_frame_duration(part) for part in data.get(f"{name}InformationSequence") or ()]
-        if any(map(math.isfinite, durations)):
-            return [durations[number - 1] for number in _frame_parts(data, name, len(durations))]
-    return [_frame_duration(data)]
-
-
-def _window_limit(data: Any, number: int, word: str) -> float:
-    """Return the "Lower" or "Upper" limit of the energy window `number`, keV; NaN if the window is not a single range."""
-    windows = data.get("EnergyWindowInformationSequence") or ()
-    ranges: Any = windows[number - 1].get("EnergyWindowRangeSequence") or () if 0 < number <= len(windows) else ()
-    limit = ranges[0].get(f"EnergyWindow{word}Limit") if len(ranges) == 1 else None
-    return math.nan if limit is None else float(limit)
-
-
-def _frame_starts(data: Any, count: int) -> list[float]:
-    """Return the starts of frames, s of an era, from those of the acquisition, its phases and frames (C.8.4.8, C.8.4.14).
-
-    The list is empty if the file states neither a time nor phases, and for rotations, whose views have no stated starts.
-    """
-    day, clock = str(data.get("AcquisitionDate") or ""), str(data.get("AcquisitionTime") or "")
-    phases = data.get("PhaseInformationSequence") or ()
-    if not (clock or phases) or data.get("RotationInformationSequence"):
-        return []
-    start = 86400.0 * date.fromisoformat(day).toordinal() if day else 0.0
-    start += _seconds_of_day(clock) if clock else 0.0
-    if not phases:
-        return [start]
-    phase_end, phase_starts, frame_steps = start, [], []
-    for phase in phases:
-        duration, pause = _frame_duration(phase), float(phase.get("PauseBetweenFrames") or 0) / 1000
-        phase_starts.append(phase_end + float(phase.get("PhaseDelay") or 0) / 1000)
-        frame_steps.append(duration + pause)
-        phase_end = phase_starts[-1] + int(phase.get("NumberOfFramesInPhase") or 1) * frame_steps[-1] - pause
-    slices = data.get("TimeSliceVector")
-    numbers = [1] * count if slices is None else list(slices)  # of the frames in their phases
-    frames = zip(_frame_parts(data, "Phase", len(phases)), numbers, strict=False)
-    return [phase_starts[phase - 1] + (number - 1) * frame_steps[phase - 1] for phase, number in frames]
-
-
-def _frame_parts(data: Any, name: str, count: int) -> list[int]:
-    """Return the number, 1 to `count`, of each frame's window, rotation or phase; without a vector, one for each block."""
-    vector = data.get(f"{name.replace(' ', '')}Vector") or np.arange(1, count + 1)
-    return [int(number) for number in np.atleast_1d(vector)]
-
-
-def _frame_duration(place: Any) -> float:
-    """Return the exposure, s, that a DICOM dataset states; NaN if it states none."""
-    return float(place.get("ActualFrameDuration") or math.nan) / 1000
-
-
-def differs(recorded: float, expected: float) -> bool:
-    """Return whether a length or time in a file differs from `expected` by more than rounding; False for NaN in the file."""
-    return not (math.isnan(recorded) or math.isclose(recorded, expected, rel_tol=_SAME_SIZE))
-
-
-_READERS: dict[str, Callable[[Path, CountsLayout], Counts]] = {
+_READERS: dict[str, Callable[[Path, CountsLayout], FileFrames]] = {
     **dict.fromkeys((".npy", ".npz"), _read_numpy),
     **dict.fromkeys((".h5", ".hdf5"), _read_hdf5),
-    ".dcm": _read_dicom,
+    ".dcm": lambda path, layout: nuclear_medicine.read(path),
     **dict.fromkeys((".mhd", ".mha"), _read_metaimage),
-    **dict.fromkeys((".hdr", ".h33", ".hs"), _read_interfile),
+    **dict.fromkeys((".hdr", ".h33", ".hs", ".h00"), lambda path, layout: interfile.read(path)),
 }
 """Readers by the endings of their files, in lower case."""
 COUNTS_FORMATS = (*_READERS, ".raw", ".bin", ".dat")
-"""Endings of files with counts; DICOM files and raw files may have any name."""
+"""Endings of files with counts; DICOM files, Interfile headers and raw files may have any name."""

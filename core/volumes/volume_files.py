@@ -65,6 +65,7 @@ def read_volume(
             contents = replace(contents, affine=real_array(affine, "affine", (4, 4)))
         if contents.quantity is not None and contents.quantity not in UNITS and quantity is None:
             raise InputError(f"it holds {contents.quantity!r}: say which quantity that is, one of {', '.join(UNITS)}")
+        _require_quantity(contents, quantity)
         return contents.to_volume(quantity or contents.quantity or "hu")
 
 
@@ -79,9 +80,15 @@ def read_volume_of(
     path = Path(path)
     contents = _read_contents(path, series, progress)
     with naming(path):
-        if contents.quantity in UNITS and contents.quantity != quantity:
-            raise InputError(f"it holds {contents.quantity}, expected {quantity} in {UNITS[quantity]}{advice}")
+        _require_quantity(contents, quantity, advice)
         return contents.to_volume(quantity)
+
+
+def _require_quantity(contents: VolumeFileContents, quantity: str | None, advice: str = "") -> None:
+    """Raise `InputError` if a file states another quantity than the user's, or an unknown one instead of CT numbers."""
+    stated = contents.quantity
+    if None not in (stated, quantity) and stated != quantity and (stated in UNITS or quantity == "hu"):
+        raise InputError(f"it holds {stated}, expected {quantity} in {UNITS.get(str(quantity), '?')}{advice}")
 
 
 def write_volume(volume: Volume, path: AnyPath) -> None:

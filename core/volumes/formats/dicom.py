@@ -22,14 +22,15 @@ from ...files import require_file
 from ...geometry.frames import affine_matrix
 from ...progress import Progress, tell
 from .contents import RAS_FROM_LPS, VolumeFileContents, require_voxels
+from .dicom_units import DicomUnit, RealWorldValues, agree, real_world_values, unit_of
 
 _SAME_ORIENTATION = 1e-4  # difference of direction cosines; they are written with 6 digits
 _SAME_POSITION = 1e-3  # mm
 _SAME_SPACING = 0.02  # relative difference of spacings; scanners round positions
 _MAX_TILT = 0.01  # tangent of the gantry's tilt, 0.6 degrees
 _UPRIGHT_ONLY = "expected upright slices: resample the series first"
-# Quantity, and factor to its unit, by DICOM's unit.
-_UNITS = {"BQML": ("activity", 1e-3), "HU": ("hu", 1.0)}
+_HOUNSFIELD = ("", "HU", "US")  # types of rescaled values of CT images: not stated, CT numbers, and unspecified
+_RESCALE = ("RescaleSlope", "RescaleIntercept", "RescaleType")
 TOMOGRAMS = ("RECON TOMO", "RECON GATED TOMO")
 """Reconstructed tomograms, by value 3 of ImageType (C.8.4.9.1.1.3)."""
 _OTHER_IMAGES = {
@@ -41,7 +42,6 @@ _OTHER_IMAGES = {
     "GATED": "gated planar images",
 }
 _NUCLEAR_MEDICINE = "1.2.840.10008.5.1.4.1.1.20"  # SOP class UID
-_BECQUERELS = "bq/ml"  # UCUM's code in lower case
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,7 +57,8 @@ class _Slice:
     slope: float  # value = slope * stored value + intercept
     intercept: float  # in the unit of the values
     thickness: float  # slice thickness, mm, or 0 if not stated
-    unit: str  # DICOM's code for the values' unit, or ""
+    unit: str  # code for the values' unit, of DICOM or UCUM, or ""
+    is_rescaled: bool  # whether the file states the rescaling
 
     @property
     def name(self) -> str:
@@ -100,9 +101,8 @@ def read(path: Path, series: str | None = None, progress: Progress | None = None
             with reading(file.name, "DICOM"):  # pydicom parses tags on access
                 slices += _read_slices(file, header)
         slices, step = _sort_slices(slices)
-        first, modality = slices[0], headers[0][1].get("Modality")
-        unknown_unit = (f"{modality} in {first.unit}" if first.unit else f"{modality}", 1.0)
-        quantity, factor = ("hu", 1.0) if modality == "CT" else _UNITS.get(first.unit, unknown_unit)
+        first = slices[0]
+        quantity, factor = _quantity(str(headers[0][1].get("Modality")), first.unit)
         rows, columns = first.shape
         require_voxels((columns, rows, len(slices)), np.dtype(np.float32))
         array = np.empty((columns, rows, len(slices)), np.float32)
@@ -111,6 +111,16 @@ def read(path: Path, series: str | None = None, progress: Progress | None = None
             tell(progress, k + 1, len(slices))
     axes = np.column_stack([*(first.orientation * np.array(first.spacing[::-1])[:, None]), step])
     return VolumeFileContents(array, RAS_FROM_LPS @ affine_matrix(axes, first.position), quantity)
+
+
+def _quantity(modality: str, code: str) -> DicomUnit:
+    """Return the quantity and factor of values in the unit `code`; the quantity of others is a text: "PT in GML"."""
+    unit = unit_of(code)
+    if modality == "CT" and code in _HOUNSFIELD:
+        return DicomUnit("hu", 1.0)
+    if unit is None or unit.quantity == "counts":
+        return DicomUnit(f"{modality} in {code}" if code else modality, 1.0)
+    return unit
 
 
 def _read_headers(path: Path) -> list[tuple[Path, Any]]:
@@ -205,6 +215,7 @@ def _read_slices(path: Path, header: Any) -> Iterator[_Slice]:
         spacing = _numbers(frame, "PixelSpacing", 2)
         if spacing.min() <= 0:
             raise InputError(f"PixelSpacing: expected more than 0 mm, got {spacing.min():g}")
+        slope, intercept, unit = _rescaling(header, frame)
         yield _Slice(
             path=path,
             frame=number,
@@ -212,15 +223,39 @@ def _read_slices(path: Path, header: Any) -> Iterator[_Slice]:
             spacing=(float(spacing[0]), float(spacing[1])),
             orientation=_directions(frame),
             position=_numbers(frame, "ImagePositionPatient", 3),
-            slope=float(_numbers(frame, "RescaleSlope", 1, 1.0)[0]),
-            intercept=float(_numbers(frame, "RescaleIntercept", 1, 0.0)[0]),
+            slope=slope,
+            intercept=intercept,
             thickness=float(_numbers(frame, "SliceThickness", 1, 0.0)[0]),
-            unit=str(header.get("Units") or frame.get("RescaleType") or ""),
+            unit=unit,
+            is_rescaled=frame.get("RescaleSlope") is not None,
         )
 
 
+def _rescaling(header: Any, frame: Any) -> RealWorldValues:
+    """Return slope, intercept and unit of a frame's values: those of its real world values, or else of its rescaling.
+
+    `InputError` where both are to one quantity and give other values.
+    """
+    slope, intercept = (
+        float(_numbers(frame, name, 1, x)[0]) for name, x in (("RescaleSlope", 1.0), ("RescaleIntercept", 0.0))
+    )
+    rescaling = RealWorldValues(slope, intercept, str(header.get("Units") or frame.get("RescaleType") or ""))
+    mapped = real_world_values(frame) or real_world_values(header)
+    stated_unit, unit = unit_of(rescaling.code), unit_of(mapped.code) if mapped else None
+    if mapped is None or (unit is None and stated_unit is not None):
+        return rescaling
+    if unit and stated_unit and unit.quantity == stated_unit.quantity and not agree([rescaling, mapped]):
+        pair = f"{slope:g} x value + {intercept:g} {rescaling.code}, RealWorldValueMapping {mapped.slope:g} x value"
+        raise InputError(f"its rescaling is {pair} + {mapped.intercept:g} {mapped.code}: expected one of them")
+    return mapped
+
+
 def _frame_tags(header: Any) -> list[Any]:
-    """Return the tags of each frame of a file: the header, or in an enhanced image the shared and the frame's groups."""
+    """Return the tags of each frame of a file: the header, or in an enhanced image the shared and the frame's groups.
+
+    Private sequences are no groups (C.7.6.16), though some repeat the tags of one. A rescaling at the top level holds for
+    frames without one.
+    """
     from pydicom.dataset import Dataset
 
     if "PerFrameFunctionalGroupsSequence" not in header:
@@ -229,9 +264,12 @@ def _frame_tags(header: Any) -> list[Any]:
     frames = []
     for frame_groups in header.PerFrameFunctionalGroupsSequence:
         frame = Dataset()
+        frame.update({tag: header[tag] for tag in _RESCALE if tag in header})
         for groups in (*shared, frame_groups):
             for group in groups:
-                if group.VR == "SQ" and group.value:
+                if group.keyword == "RealWorldValueMappingSequence":
+                    frame.add(group)
+                elif group.VR == "SQ" and group.value and not group.tag.is_private:
                     frame.update(group.value[0])
         frames.append(frame)
     return frames
@@ -248,6 +286,8 @@ def _sort_slices(slices: list[_Slice]) -> tuple[list[_Slice], Floats]:
         for feature, is_same in (
             (f"{shape[1]} x {shape[0]} pixels", shape == first.shape),
             (f"pixels of {spacing[0]:g} x {spacing[1]:g} mm", np.allclose(spacing, first.spacing, 1e-4)),
+            (f"values in {image.unit or 'no stated unit'}", image.unit == first.unit),
+            ("a RescaleSlope" if image.is_rescaled else "no RescaleSlope", image.is_rescaled == first.is_rescaled),
             ("another orientation", np.allclose(image.orientation, first.orientation, atol=_SAME_ORIENTATION)),
         ):
             if not is_same:
@@ -311,7 +351,9 @@ def _read_pixels(slices: list[_Slice]) -> Iterator[tuple[_Slice, Array]]:
 def decode_pixels(data: Any) -> Array:
     """Return the stored values of a pydicom data set that was read with its pixels."""
     try:
-        return np.asarray(data.pixel_array)
+        stored = np.asarray(data.pixel_array)
+        unused_bits = int(data.get("HighBit", 0)) + 1 - int(data.get("BitsStored", 1))
+        return stored >> unused_bits if unused_bits > 0 and "PixelData" in data else stored
     except Exception as error:  # truncated, or compressed by a method that is not installed
         syntax = data.file_meta.TransferSyntaxUID
         fault = f"cannot be read ({first_line(error)})"
@@ -337,8 +379,7 @@ def _tomogram_tags(header: Any) -> list[dict[str, Any]]:
     slices = _numbers(header, "SliceVector", n_frames) if has_slices else np.arange(1.0, n_frames + 1)
     n_slices = len(np.unique(slices)) if has_slices else int(header.get("NumberOfSlices") or 0)
     _require_one_volume(header, n_frames, n_slices)
-    names = ("PixelSpacing", "SliceThickness", "RescaleType", "RescaleSlope", "RescaleIntercept")
-    shared = {name: header.get(name) for name in names} | _becquerel_scaling(header)
+    shared = {name: header.get(name) for name in ("PixelSpacing", "SliceThickness", *_RESCALE)}
     # In the standard, position and orientation are properties of the detector, even in a tomogram.
     for name in ("ImagePositionPatient", "ImageOrientationPatient"):
         values = [tags.get(name) for tags in (*(header.get("DetectorInformationSequence") or ()), header)]
@@ -376,16 +417,6 @@ def _slice_spacing(header: Any) -> float:
     remedy = f"its SliceThickness, {thickness:g} mm, was taken, along the normal"
     warn(f"{fault}: {remedy}; check that head and feet are not exchanged")
     return thickness
-
-
-def _becquerel_scaling(header: Any) -> dict[str, Any]:
-    """Return tags that rescale stored values to Bq/mL, from RealWorldValueMappingSequence; none if the file has none."""
-    for item in header.get("RealWorldValueMappingSequence") or ():
-        units = item.get("MeasurementUnitsCodeSequence") or ()
-        if any(str(unit.get("CodeValue")).lower() == _BECQUERELS for unit in units) and "RealWorldValueSlope" in item:
-            slope, intercept = item.RealWorldValueSlope, item.get("RealWorldValueIntercept")
-            return {"RescaleSlope": slope, "RescaleIntercept": intercept, "RescaleType": "BQML"}
-    return {}
 
 
 def _numbers(header: Any, name: str, length: int, default: float | None = None) -> Floats:

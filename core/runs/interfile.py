@@ -1,0 +1,219 @@
+"""Read Interfile 3.3: a header of ``key := value`` lines, as GATE 9, SIMIND and STIR write, and the numbers beside it.
+
+Reference: A. Todd-Pokropek, T. D. Cradduck, F. Deconinck, "A file format for the exchange of nuclear medicine image data: a
+specification of Interfile version 3.3", Nuclear Medicine Communications 13 (1992) 673-699. STIR numbers the values of time
+frames: ``image duration (sec)[2]``.
+"""
+
+import math
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from ..arrays import Floats
+from ..errors import InputError
+from ..files import require_file
+from .frame_facts import FileFrames, file_numbers, rescaled
+from .stated_times import moment, past_midnight, stated_duration, stated_number
+
+_LONGEST_HEADER = 1 << 20  # bytes
+_NUMBER_TYPES = ("u1", "u2", "u4", "u8", "i1", "i2", "i4", "i8", "f4", "f8")
+_MILLIMETRES = {"mm/pixel": 1.0, "mmpixel": 1.0, "mm": 1.0, "cm/pixel": 10.0, "cmpixel": 10.0, "cm": 10.0}
+_FACTOR = re.compile(
+    r"quantification units|(data |image )?((re)?scal\w+|slope) (slope|factor)|(data )?rescale slope|scale factor"
+)
+_OFFSET = re.compile(r"(data )?rescale (offset|intercept)|(data|image) (scale|scaling) offset")
+_EXPOSURES = ("time per projection (sec)", "image duration (sec)", "study duration (sec)")
+_UNITS_OF_COUNTS = ("counts", "count", "cnts")  # words that some programs write as quantification units
+
+
+def begins(path: Path) -> bool:
+    """Return whether the file at `path` begins as an Interfile header does."""
+    with open(path, "rb") as file:
+        return bool(re.match(rb"(\xef\xbb\xbf)?[\s!]*interfile", file.read(64).lower()))
+
+
+def read(path: Path) -> FileFrames:
+    """Read the frames of a header and of the file of numbers that it names; `InputError` for keys that cannot be applied."""
+    header = _Header(path)
+    columns, rows = (header.whole(f"matrix size [{axis}]") for axis in (1, 2))
+    n_bytes, form = header.whole("number of bytes per pixel"), header.text("number format", "nothing").lower()
+    letter = {"unsigned integer": "u", "signed integer": "i"}.get(form, "f" if form.endswith("float") else "")
+    if letter + str(n_bytes) not in _NUMBER_TYPES:
+        raise InputError(f"number format {form} of {n_bytes} bytes: expected integers, or floats of 4 or 8 bytes")
+    byte_order = header.text("imagedata byte order").upper().replace(" ", "")
+    if n_bytes > 1 and byte_order not in ("LITTLEENDIAN", "BIGENDIAN"):
+        raise InputError(f"imagedata byte order {byte_order or 'missing'}: expected LITTLEENDIAN or BIGENDIAN")
+    number_type = np.dtype((">" if byte_order == "BIGENDIAN" else "<") + letter + str(n_bytes))
+    data_path, frame_size = _data_file(path, header.text("name of data file")), rows * columns * n_bytes
+    offset = header.whole("data offset in bytes", 2048 * header.whole("data starting block", 0, 0), 0)
+    n_frames = header.whole("total number of images", max(1, (data_path.stat().st_size - offset) // frame_size))
+    frames = file_numbers(data_path, number_type, (n_frames, rows, columns), offset)
+    n_windows = header.whole("number of energy windows", 1)
+    if n_frames % n_windows:
+        raise InputError(f"number of energy windows = {n_windows}: expected one that divides the {n_frames} images")
+    sizes = [header.pixel_size(axis) for axis in (1, 2)]
+    facts: dict[str, Sequence[float]] = {"pixel": sizes, "window": range(1, n_windows + 1)}
+    for name, word in (("low", "lower"), ("high", "upper")):
+        keys = [f"energy window {word} level [{window}]" for window in facts["window"]]
+        facts[name] = [stated_number(header.text(key), key, "keV") for key in keys]
+    facts["time"], facts["start"] = _times(header, n_frames, n_windows)
+    kind = f"{n_windows} energy windows" if n_windows > 1 else ""
+    return FileFrames(rescaled(frames, *_scale(header, n_frames)), kind, facts)
+
+
+class _Header:
+    """Keys of a header, in lower case, with their values: a repeated key has several, and so has one with numbers in [ ]."""
+
+    def __init__(self, path: Path) -> None:
+        lines = path.read_bytes()[:_LONGEST_HEADER].decode("latin-1").removeprefix("\xef\xbb\xbf").lstrip().splitlines()
+        if not lines or not lines[0].lstrip("! \t").upper().startswith("INTERFILE"):
+            raise InputError("not an Interfile header: expected !INTERFILE in the first line")
+        self.values: dict[str, list[str]] = {}
+        for line in lines:
+            key, assigned, value = line.partition(":=")
+            key = " ".join(key.strip().lstrip("!").lower().replace("[", " [").split())
+            if assigned and not line.lstrip().startswith(";"):
+                self.values.setdefault(key, []).append(value.strip())
+
+    def all(self, key: str) -> list[str]:
+        """Return the values of a key and of the key with numbers, ``key [1]``, ``key [2]``; empty ones are left out."""
+        numbered = [f"{key} [{number}]" for number in range(1, len(self.values) + 1)]
+        return [text for name in (key, *numbered) for text in self.values.get(name, ()) if text]
+
+    def text(self, key: str, default: str = "") -> str:
+        """Return the value of a key; raise `InputError` where it is repeated with other values."""
+        values = list(dict.fromkeys(self.values.get(key, ())))
+        if len(values) > 1:
+            raise InputError(f"{key} = {values[0]} and {values[1]}: expected one value")
+        return values[0] if values else default
+
+    def numbers(self, key: str, default: float = math.nan) -> list[float]:
+        """Return the numbers of a key's values, NaN for one that says nothing; [default] where the key is missing."""
+        return [stated_number(text, key) for text in self.all(key)] or [default]
+
+    def whole(self, key: str, default: int | None = None, least: int = 1) -> int:
+        """Return the whole number of a key, at least `least`, or the default where the header says none."""
+        text = self.text(key)
+        number = stated_number(text, key, "a whole number")
+        if math.isnan(number) or (number == 0 and default is not None):
+            if default is None:
+                raise InputError(f"it has no {key!r}")
+            return default
+        if number < least or number != int(number):
+            raise InputError(f"{key} = {text}: expected a whole number from {least}")
+        return int(number)
+
+    def pixel_size(self, axis: int) -> float:
+        """Return the size of a pixel along axis 1 or 2, mm; NaN where the header says none."""
+        for key in self.values:
+            match = re.fullmatch(rf"scaling factor( \((.*)\))? \[{axis}\]", key)
+            if match is not None:
+                size = stated_duration(self.text(key), key)
+                unit = (match[2] or "").replace(" ", "")
+                if unit not in _MILLIMETRES and not math.isnan(size):
+                    raise InputError(f"{key} = {self.text(key)}: expected its unit as (mm/pixel)")
+                return size * _MILLIMETRES.get(unit, math.nan)
+        return math.nan
+
+
+def _scale(header: _Header, n_frames: int) -> tuple[Floats, float]:
+    """Return the factor of each frame's numbers and the number to be added; several factors that differ are refused."""
+    scales: dict[str, list[float]] = {}
+    for key in header.values:
+        name = re.sub(r" \[\d+\]$", "", key)
+        if _FACTOR.fullmatch(name) or _OFFSET.fullmatch(name):
+            texts = ["1" if text.lower() in _UNITS_OF_COUNTS else text for text in header.all(name)]
+            neutral = 1.0 if _FACTOR.fullmatch(name) else 0.0
+            numbers = [stated_number(text, name, "a factor of the counts") for text in texts]
+            if any(number not in (neutral, math.nan) and not math.isnan(number) for number in numbers):
+                scales[name] = [neutral if math.isnan(number) else number for number in numbers]
+    factors = [(name, numbers) for name, numbers in scales.items() if _FACTOR.fullmatch(name)]
+    if any(numbers != factors[0][1] for _, numbers in factors):
+        pair = " and ".join(f"{name} = {', '.join(map(str, numbers))}" for name, numbers in factors[:2])
+        raise InputError(f"{pair}: expected one factor of the counts")
+    offsets = [number for name, numbers in scales.items() if _OFFSET.fullmatch(name) for number in numbers]
+    if len(set(offsets)) > 1:
+        raise InputError(f"several rescale offsets ({', '.join(map(str, offsets))}): expected one")
+    slopes = _in_blocks(factors[0][1] if factors else [1.0], [], n_frames, factors[0][0] if factors else "")
+    return np.array(slopes), offsets[0] if offsets else 0.0
+
+
+def _in_blocks(values: list[float], sizes: list[int], n_frames: int, key: str) -> list[float]:
+    """Return a value for each of `n_frames` from those of blocks, of stated `sizes` or of equal ones.
+
+    Blocks of which the sizes add up to a part of the frames are repeated, as in each energy window.
+    """
+    if sizes and len(sizes) == len(values):
+        in_part = [value for value, size in zip(values, sizes, strict=True) for _ in range(size)]
+        if n_frames % len(in_part) == 0:
+            return in_part * (n_frames // len(in_part))
+        raise InputError(f"groups of {' + '.join(map(str, sizes))} images: expected them to make up {n_frames} images")
+    if not values or n_frames % len(values):
+        raise InputError(f"{key}: {len(values)} values for {n_frames} images: expected one, or as many for each")
+    return [value for value in values for _ in range(n_frames // len(values))]
+
+
+def _times(header: _Header, n_frames: int, n_windows: int) -> tuple[list[float], list[float]]:
+    """Return the exposures of all frames, s, and their starts, s after any moment; NaN or empty if not stated."""
+    is_gated = any(key.startswith(("gated", "gspect", "number of images in time window")) for key in header.values)
+    is_gated |= "gated" in header.text("type of data").lower()
+    size_key = "number of images in time window" if is_gated else "number of images this frame group"
+    sizes = [int(stated_number(text, size_key, "a whole number")) for text in header.all(size_key)]
+    for key in _EXPOSURES[1:2] if is_gated else _EXPOSURES:
+        durations = [stated_duration(text, key) for text in header.all(key)]
+        if any(map(math.isfinite, durations)):
+            break
+    else:
+        durations, key = [math.nan], _EXPOSURES[0]
+    if is_gated:  # the duration is a gate's in one beat
+        cycle_key = "number of cardiac cycles (acquired)"
+        cycles = [stated_duration(text, cycle_key) for text in header.all(cycle_key)] or [math.nan]
+        if len(cycles) not in (1, len(durations)) and len(durations) > 1:
+            raise InputError(f"{cycle_key}: {len(cycles)} values beside {len(durations)} of {key}; expected as many")
+        durations = np.multiply(durations, cycles).tolist()
+    times = _in_blocks(durations, sizes, n_frames, key)
+    return times, _starts(header, times, [] if is_gated else sizes, n_frames // n_windows)
+
+
+def _starts(header: _Header, times: list[float], sizes: list[int], n_images: int) -> list[float]:
+    """Return the starts of the frames, s after any moment; empty where the header says none.
+
+    Images of frame groups, in `sizes` in each energy window's `n_images`, follow each other with the stated pauses.
+    """
+    day, clock = header.text("study date"), header.text("study time")
+    clocks = [moment(day, text, "image start time") for text in header.all("image start time")]
+    begin = clocks[0] if clocks else moment(day, clock, "study time")
+    relative_key = "image relative start time (sec)"
+    relative = [stated_number(text, relative_key, "seconds") for text in header.all(relative_key)]
+    n_frames = len(times)
+    if relative:
+        starts = _in_blocks(relative, sizes, n_frames, relative_key)
+    elif len(clocks) > 1:
+        return _in_blocks(past_midnight(np.array(clocks)).tolist(), sizes, n_frames, "image start time")
+    elif sizes and header.whole("number of detector heads", 1) == 1:
+        keys = "pause between images (sec)", "pause between frame groups (sec)"
+        between_images, between_groups = (
+            [0.0 if math.isnan(pause) else pause for pause in _in_blocks(header.numbers(key, 0.0), [], len(sizes), key)]
+            for key in keys
+        )
+        starts, end = [], 0.0
+        for group, size in enumerate(sizes):
+            for _ in range(size):
+                starts.append(end)
+                end += times[len(starts) - 1] + between_images[group]
+            end += between_groups[group] - between_images[group]
+        starts = _in_blocks(starts, [1] * len(starts), n_frames, "")
+    else:
+        return [] if math.isnan(begin) else [begin]
+    return [start + (0.0 if math.isnan(begin) else begin) for start in starts]
+
+
+def _data_file(path: Path, name: str) -> Path:
+    """Return the file of numbers: at the header's path, or beside the header, since both may have been moved together."""
+    for candidate in (path.parent / name, path.parent / Path(name.replace("\\", "/")).name):
+        if name and candidate.exists():
+            return require_file(candidate)
+    raise InputError(f"its numbers are in {name or 'no file that it names'}, which is not beside it")

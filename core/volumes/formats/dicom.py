@@ -6,11 +6,14 @@ or head, whichever is closest to the slices' normal. A tomogram states the posit
 between slices (DICOM part 3, C.8.4.11 and C.8.4.15).
 """
 
+import gzip
 import textwrap
 import warnings
 from collections import defaultdict
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -27,8 +30,7 @@ from .dicom_units import DicomUnit, RealWorldValues, agree, real_world_values, u
 _SAME_ORIENTATION = 1e-4  # difference of direction cosines; they are written with 6 digits
 _SAME_POSITION = 1e-3  # mm
 _SAME_SPACING = 0.02  # relative difference of spacings; scanners round positions
-_MAX_TILT = 0.01  # tangent of the gantry's tilt, 0.6 degrees
-_UPRIGHT_ONLY = "expected upright slices: resample the series first"
+_MOST_FILES = 5000  # files among which folders of images are looked for, to name them in a message
 _HOUNSFIELD = ("", "HU", "US")  # types of rescaled values of CT images: not stated, CT numbers, and unspecified
 _RESCALE = ("RescaleSlope", "RescaleIntercept", "RescaleType")
 TOMOGRAMS = ("RECON TOMO", "RECON GATED TOMO")
@@ -79,7 +81,10 @@ def image_kind(header: Any) -> str:
 
 
 def require_grey(header: Any) -> None:
-    """Raise `InputError` for images with several values per pixel."""
+    """Raise `InputError` for images with several values per pixel, or with numbers in other than the lowest bits."""
+    bits, high = (int(header.get(name, 16)) for name in ("BitsStored", "HighBit"))
+    if bits != high + 1 and "HighBit" in header:
+        raise InputError(f"HighBit {high}: expected {bits - 1}, one below BitsStored")
     if header.get("SamplesPerPixel", 1) != 1:
         raise InputError(f"expected one value per pixel, found {header.SamplesPerPixel} (a colour image)")
 
@@ -133,18 +138,20 @@ def _read_headers(path: Path) -> list[tuple[Path, Any]]:
     headers: dict[Path, Any] = {}
     without_pixels: dict[Path, Any] = {}
     for file in files:
-        if file in headers or file.is_dir():
+        if file in headers or file.is_dir() or file.name.startswith("._"):  # ._NAME: a folder's data of macOS
             continue
         try:
-            if not (is_dicom(require_file(file)) or file.suffix.lower() in (".dcm", ".ima")):
+            if not (is_dicom(require_file(file)) or file.suffix.lower() in (".dcm", ".ima") or _is_bare(file)):
                 continue
-            header = pydicom.dcmread(file, stop_before_pixels=True)
+            header = pydicom.dcmread(file, stop_before_pixels=True, force=_is_bare(file))
         except InvalidDicomError:
             raise InputError(f"{file.name} is no DICOM file") from None
+        except InputError as error:
+            raise InputError(f"{file.name}: {error}") from None
         except Exception as error:  # whatever pydicom raises on a damaged file
             raise InputError(f"{file.name} cannot be read as DICOM ({first_line(error)})") from None
         if file == path:
-            if "Rows" in header and _is_whole_volume(header):
+            if "Rows" in header and (_is_whole_volume(header) or "PerFrameFunctionalGroupsSequence" in header):
                 return [(file, header)]
             series_uid = header.get("SeriesInstanceUID")
         # Directories, reports and plans have no pixels.
@@ -153,7 +160,12 @@ def _read_headers(path: Path) -> list[tuple[Path, Any]]:
         elif series_uid is None or header.get("SeriesInstanceUID") == series_uid:
             headers[file] = header
     if not headers:
-        raise InputError("expected a folder with the images of a DICOM series; it has none")
+        top = path if path.is_dir() else path.parent
+        files = [file for file in islice(top.rglob("*"), _MOST_FILES) if file.is_file() and is_dicom(file)]
+        folders = ", ".join(sorted({str(file.parent.relative_to(top)) for file in files} - {"."})) or "none"
+        raise InputError(
+            f"expected a folder with the images of a DICOM series; folders with DICOM files in it: {folders}"
+        )
     # pydicom reads a truncated file as one with fewer tags. If it has the SOP class of the images, it is one of them.
     image_classes = set(map(_sop_class, headers.values()))
     for file, header in without_pixels.items():
@@ -161,6 +173,20 @@ def _read_headers(path: Path) -> list[tuple[Path, Any]]:
         if is_of_series and any(uid.startswith(_sop_class(header)) for uid in image_classes):
             raise InputError(f"{file.name}: an image without Rows: the file is cut off or damaged")
     return list(headers.items())
+
+
+def _is_bare(path: Path) -> bool:
+    """Return whether a file is DICOM without the prefix "DICM": it begins with the length of the group 0002, or group 0008.
+
+    Raises `InputError` for a packed DICOM file, which is not read.
+    """
+    with open(path, "rb") as file:
+        begin = file.read(8)
+    if begin[:2] == b"\x1f\x8b":
+        with suppress(OSError, EOFError), gzip.open(path) as packed:
+            if packed.read(132)[128:] == b"DICM":
+                raise InputError("it is packed: unpack it first")
+    return begin[:4] == b"\x02\0\0\0" or (begin[:2] == b"\x08\0" and begin[2:4] <= b"\x20\0")
 
 
 def _is_nuclear_medicine(header: Any) -> bool:
@@ -185,15 +211,17 @@ def _choose_series(headers: list[tuple[Path, Any]], path: Path, series: str | No
         all_series[str(header.get("SeriesInstanceUID", ""))].append((file, header))
     if len(all_series) == 1 and series is None:
         return headers
-    texts = []  # such as 3 "Thorax 1.0" (133 images)
+    names = {}  # such as 3 "Thorax 1.0"
     for uid, images in all_series.items():
         number, description = images[0][1].get("SeriesNumber"), images[0][1].get("SeriesDescription")
-        name = " ".join(str(x) for x in (number, description and f'"{description}"') if x is not None) or uid
-        texts.append(f"{name} ({len(images)} images)")
+        names[uid] = " ".join(str(x) for x in (number, description and f'"{description}"') if x is not None) or uid
+    repeated = {name for name in names.values() if list(names.values()).count(name) > 1}
+    names = {uid: f"{name} {uid}" if name in repeated else name for uid, name in names.items()}
+    texts = [f"{names[uid]} ({len(images)} images)" for uid, images in all_series.items()]
     if series is None:
         raise InputError(f"it holds {len(all_series)} series, choose one: {'; '.join(texts)}")
-    names = ("SeriesNumber", "SeriesDescription", "SeriesInstanceUID")
-    matches = [images for images in all_series.values() if str(series) in (str(images[0][1].get(n, "")) for n in names)]
+    tags = ("SeriesNumber", "SeriesDescription", "SeriesInstanceUID")
+    matches = [images for images in all_series.values() if str(series) in (str(images[0][1].get(n, "")) for n in tags)]
     if len(matches) != 1:
         raise InputError(f"{len(matches) or 'no'} series {series!r} in it; there are {'; '.join(texts)}")
     return matches[0]
@@ -202,9 +230,6 @@ def _choose_series(headers: list[tuple[Path, Any]], path: Path, series: str | No
 def _read_slices(path: Path, header: Any) -> Iterator[_Slice]:
     """Yield the slices of a file, whose `header` has been read."""
     require_grey(header)
-    tilt = float(header.get("GantryDetectorTilt") or 0.0)
-    if abs(tilt) > 0.01:
-        raise InputError(f"the gantry is tilted by {tilt:g} degrees; {_UPRIGHT_ONLY}")
     if "ModalityLUTSequence" in header:
         raise InputError("values by a table (ModalityLUTSequence) are not read; expected RescaleSlope")
     n_frames = int(header.get("NumberOfFrames") or 1)
@@ -264,7 +289,8 @@ def _frame_tags(header: Any) -> list[Any]:
     frames = []
     for frame_groups in header.PerFrameFunctionalGroupsSequence:
         frame = Dataset()
-        frame.update({tag: header[tag] for tag in _RESCALE if tag in header})
+        for name in filter(header.__contains__, _RESCALE):
+            frame.add(header[name])
         for groups in (*shared, frame_groups):
             for group in groups:
                 if group.keyword == "RealWorldValueMappingSequence":
@@ -278,7 +304,8 @@ def _frame_tags(header: Any) -> list[Any]:
 def _sort_slices(slices: list[_Slice]) -> tuple[list[_Slice], Floats]:
     """Return the slices sorted along their normal, and the step (3,), mm, LPS, from slice to slice.
 
-    Raises `InputError` unless they are one stack of equal, evenly spaced, upright slices.
+    Of a tilted gantry the step is not along the normal. Raises `InputError` unless the slices are one stack of equal and
+    evenly spaced ones.
     """
     first = slices[0]
     for image in slices:
@@ -309,11 +336,14 @@ def _sort_slices(slices: list[_Slice]) -> tuple[list[_Slice], Floats]:
         conflict = f"{slices[k].name} and {slices[k + 1].name} lie at the same place ({heights[k]:g} mm)"
         raise InputError(f"{conflict}: expected one slice at each, of one point in time")
     median = float(np.sort(gaps)[(len(gaps) - 1) // 2])
-    uneven = np.flatnonzero(np.abs(gaps - median) > _SAME_SPACING * median + 0.01)
+    rounding = min(0.1 ** max(map(_decimals, positions.ravel().tolist())), 0.25 * median)
+    uneven = np.flatnonzero(np.abs(gaps - median) > _SAME_SPACING * median + 0.01 + rounding)
     if len(uneven):
         k = int(uneven[0])
         n_missing = round(float(gaps[k]) / median) - 1
         fault = f"{n_missing} slice{'s' * (n_missing > 1)} missing" if n_missing > 0 else "uneven slices"
+        if len(uneven) > 1 and np.ptp(gaps[uneven]) < _SAME_SPACING * median + 0.01 + rounding:
+            fault = "the distance of the slices changes"
         fault += f" between {slices[k].name} and {slices[k + 1].name}"
         raise InputError(f"{fault}: {gaps[k]:g} mm apart at {heights[k]:g} mm, the others {median:g} mm")
     if median > 1.5 * first.thickness > 0:
@@ -322,16 +352,17 @@ def _sort_slices(slices: list[_Slice]) -> tuple[list[_Slice], Floats]:
     step = (last.position - first.position) / (len(slices) - 1)
     offsets = positions - first.position
     sideways = offsets - np.outer(offsets @ normal, normal)
-    tilt = float(np.linalg.norm(sideways[-1]) / (heights[-1] - heights[0]))
-    if tilt > _MAX_TILT:
-        angle, ends = f"{np.degrees(np.arctan(tilt)):.1f} degrees", f"{first.name} to {last.name}"
-        raise InputError(f"the gantry is tilted by {angle} (slices move sideways from {ends}); {_UPRIGHT_ONLY}")
     fractions = (heights - heights[0]) / (heights[-1] - heights[0])
     deviations = np.linalg.norm(sideways - np.outer(fractions, sideways[-1]), axis=1)
     if deviations.max() > 0.1 * min(first.spacing):
         worst = slices[int(deviations.argmax())]
         raise InputError(f"{worst.name} lies {deviations.max():.3g} mm beside the other slices")
     return slices, step
+
+
+def _decimals(number: float) -> int:
+    """Return the number of decimals with which a file writes a number."""
+    return len(f"{number:.9g}".partition(".")[2])
 
 
 def _read_pixels(slices: list[_Slice]) -> Iterator[tuple[_Slice, Array]]:
@@ -344,16 +375,14 @@ def _read_pixels(slices: list[_Slice]) -> Iterator[tuple[_Slice, Array]]:
         if image.path != path:
             path = image.path
             with naming(image.name):
-                frames = decode_pixels(pydicom.dcmread(path)).reshape(-1, *image.shape)
+                frames = decode_pixels(pydicom.dcmread(path, force=True)).reshape(-1, *image.shape)
         yield image, frames[image.frame]
 
 
 def decode_pixels(data: Any) -> Array:
     """Return the stored values of a pydicom data set that was read with its pixels."""
     try:
-        stored = np.asarray(data.pixel_array)
-        unused_bits = int(data.get("HighBit", 0)) + 1 - int(data.get("BitsStored", 1))
-        return stored >> unused_bits if unused_bits > 0 and "PixelData" in data else stored
+        return np.asarray(data.pixel_array)
     except Exception as error:  # truncated, or compressed by a method that is not installed
         syntax = data.file_meta.TransferSyntaxUID
         fault = f"cannot be read ({first_line(error)})"

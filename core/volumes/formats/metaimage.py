@@ -22,6 +22,9 @@ _TYPES = {
     "MET_FLOAT": "f4", "MET_DOUBLE": "f8",
 }  # fmt: skip
 _MILLIMETRES = {"mm": 1.0, "cm": 10.0, "um": 0.001, "?": 1.0}
+_SPACINGS, _OFFSETS = ("ElementSpacing", "ElementSize"), ("Offset", "Position", "Origin")
+_MATRICES = ("TransformMatrix", "Rotation", "Orientation")
+_OF_AXES = (*_SPACINGS, *_OFFSETS, *_MATRICES)
 _LONGEST_HEADER = 1 << 16
 
 
@@ -30,6 +33,14 @@ def read(path: Path) -> VolumeFileContents:
     with open(path, "rb") as file:
         header = _read_header(file)
         sizes = _numbers(header, ("DimSize",), None)
+        if len(sizes) == 4 and sizes[3] == 1:  # one volume
+            sizes = sizes[:3]
+            for key, value in header.items():
+                words = value.split()
+                if len(words) in (4, 16) and key in _OF_AXES:
+                    header[key] = " ".join(
+                        words[row * 4 + axis] for row in range(max(1, len(words) // 5)) for axis in range(3)
+                    )
         if not (sizes == np.floor(sizes)).all():
             raise InputError(f"DimSize = {header['DimSize']}: expected whole numbers")
         shape = tuple(int(n) for n in sizes)
@@ -101,19 +112,17 @@ def _decompress(header: dict[str, str], file: BinaryIO, size: int, name: str) ->
 
 def _affine(header: dict[str, str], path: Path) -> Floats:
     """Return the affine world-from-index, mm, in RAS; warn of assumptions about missing fields."""
-    spacing_keys, offset_keys = ("ElementSpacing", "ElementSize"), ("Offset", "Position", "Origin")
-    matrix_keys = ("TransformMatrix", "Rotation", "Orientation")
     letters = header.get("AnatomicalOrientation", "RAI")  # ITK writes it beside the matrix, which takes precedence
-    if not header.keys() & set(matrix_keys) and letters.upper() not in ("RAI", "???"):
+    if not header.keys() & set(_MATRICES) and letters.upper() not in ("RAI", "???"):
         raise InputError(f"AnatomicalOrientation = {letters} without a TransformMatrix: expected the matrix, or RAI")
     # Row i of the matrix is the direction of axis i.
-    directions = _numbers(header, matrix_keys, np.eye(3).ravel()).reshape(3, 3)
-    axes, origin = directions.T * _numbers(header, spacing_keys, np.ones(3)), _numbers(header, offset_keys, np.zeros(3))
+    directions = _numbers(header, _MATRICES, np.eye(3).ravel()).reshape(3, 3)
+    axes, origin = directions.T * _numbers(header, _SPACINGS, np.ones(3)), _numbers(header, _OFFSETS, np.zeros(3))
     unit = header.get("DistanceUnits", "?")
     if unit not in _MILLIMETRES:
         raise InputError(f"DistanceUnits = {unit}: expected mm, cm or um")
-    assumptions = ["voxels of 1 mm"] * (not header.keys() & set(spacing_keys))
-    assumptions += ["the first voxel's centre at (0, 0, 0)"] * (not header.keys() & set(offset_keys))
+    assumptions = ["voxels of 1 mm"] * (not header.keys() & set(_SPACINGS))
+    assumptions += ["the first voxel's centre at (0, 0, 0)"] * (not header.keys() & set(_OFFSETS))
     warn_of_assumptions(path, assumptions)
     return RAS_FROM_LPS @ affine_matrix(axes * _MILLIMETRES[unit], origin * _MILLIMETRES[unit])
 

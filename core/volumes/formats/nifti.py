@@ -48,6 +48,8 @@ def _open_image(path: Path, stream: Any) -> Any:
         logger.disabled = was_disabled
     if not isinstance(image, nibabel.AnalyzeImage):  # the base class of NIfTI's
         raise InputError(f"expected NIfTI, found {type(image).__name__}")
+    if isinstance(image, nibabel.Nifti1Image) and image.dataobj.offset < image.header.single_vox_offset:
+        raise InputError(f"vox_offset {image.dataobj.offset}: expected {image.header.single_vox_offset} or more")
     return nibabel.squeeze_image(image)  # (x, y, z, 1) is common
 
 
@@ -66,6 +68,8 @@ def _contents(image: Any, path: Path) -> VolumeFileContents:
         return VolumeFileContents(image.get_fdata(dtype=np.float32, caching="unchanged"), affine)
     if header["qform_code"] == header["sform_code"] == 0:
         warn(f"{path}: it does not say where the patient lies: taken as centred, x from right to left")
+    elif header["qform_code"] > 0 and header["sform_code"] > 0 and not header.get_sform()[:3, :3].any():
+        affine = np.array(header.get_qform(), np.float64)  # a sform of zeros is none
     elif header["qform_code"] > 0 and header["sform_code"] > 0:
         corners = np.array(list(np.ndindex(2, 2, 2))) * (np.array(image.shape) - 1)
         gap = np.linalg.norm(moved(affine - header.get_qform(), corners), axis=1).max() / min(header.get_zooms())

@@ -56,6 +56,7 @@ def read(path: Path) -> VolumeFileContents:
     for name in ("type", "sizes"):
         if name not in header:
             raise InputError(f"it has no field {name}: it is damaged or ends early")
+    single = _single_axis(header)
     value_type = header["type"]
     if value_type == "block":
         raise InputError("expected real numbers, found blocks of bytes")
@@ -74,8 +75,24 @@ def read(path: Path) -> VolumeFileContents:
     except Exception as error:  # pynrrd's message says little or nothing about missing data
         sizes = " x ".join(map(str, header["sizes"]))
         raise InputError(f"its data are damaged or end early; expected {sizes} voxels ({first_line(error)})") from error
+    array = array if single is None else array.squeeze(single)
     unit = header.get("unit") or header.get("sample units")
     return VolumeFileContents(array, affine, header.get("quantity"), _UNITS.get(unit.lower(), unit) if unit else None)
+
+
+def _single_axis(header: dict[str, Any]) -> int | None:
+    """Return the axis of one element that a header has beside three others, and remove it from the header's fields."""
+    sizes = list(header["sizes"])
+    if len(sizes) != 4 or 1 not in sizes:
+        return None
+    kinds = [kind.lower() for kind in header.get("kinds", ["space"] * 4)]
+    axis = max(range(4), key=lambda axis: (sizes[axis] == 1, kinds[axis] not in _SPATIAL, axis))
+    for name in ("sizes", "kinds", "spacings", "axis mins", "axis maxs", "centerings", "units", "space directions"):
+        if len(values := header.get(name, ())) == 4:
+            header[name] = np.delete(np.asarray(values), axis, axis=0) if name != "kinds" else [
+                kind for index, kind in enumerate(values) if index != axis
+            ]  # fmt: skip
+    return axis
 
 
 def write(volume: Volume, temporary: Path) -> None:

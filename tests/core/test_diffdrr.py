@@ -259,8 +259,7 @@ def test_rays_from_within_the_volume_and_away_from_it_are_followed_both_ways(sub
         along = (targets[b] - start) * 50
         expected = mph.trace_rays(subject.density.double(), start - along, start + along, grid=drr.grid)
         np.testing.assert_allclose(images[b].reshape(-1), expected, rtol=1e-4, atol=1e-4)
-    for b in range(3):  # alone, too
-        np.testing.assert_allclose(drr(poses[b])[0, 0], images[b], rtol=1e-5, atol=1e-5)
+        np.testing.assert_allclose(drr(poses[b])[0, 0], images[b], rtol=1e-5, atol=1e-5)  # alone, too
 
 
 def test_a_call_copies_no_volume_and_sees_every_change_of_it(rng):

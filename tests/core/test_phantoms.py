@@ -381,24 +381,16 @@ def test_what_cannot_be_is_refused_in_one_line(make, message):
 def test_what_just_fits_is_made_and_holds_its_parts():
     body, ball = np.pi * (147**2 + 77**2) / 2 + 140 * 77, np.pi / 6  # mm^2; times the diameter's cube
     cylinder, none = np.pi * 108**2 * 186, (0,) * 6
+    large = mph.NemaBody(sphere_diameters=(0, 0, 140, 0, 0, 0), lung_diameter=0, length=140)
+    touching = mph.NemaBody(sphere_diameters=(57.2,) * 6, lung_diameter=57.2)
     spheres = mph.JaszczakPhantom(sphere_diameters=(54,) * 6, sphere_height=159, rod_height=132)
+    single = {"sphere_diameters": (*none[1:], 186), "sphere_ring_radius": 0, "sphere_height": 93}
     for phantom, content in (
-        (
-            mph.NemaBody(sphere_diameters=(0, 0, 140, 0, 0, 0), lung_diameter=0, length=140),
-            5.3 * 140 * body + 15.9 * ball * 140**3,
-        ),
+        (large, 5.3 * 140 * body + 15.9 * ball * 140**3),
         (mph.NemaBody(sphere_diameters=none, lung_diameter=224, length=1), 5.3 * (body - np.pi * 112**2)),
-        (
-            mph.NemaBody(sphere_diameters=(57.2,) * 6, lung_diameter=57.2),
-            5.3 * 180 * (body - np.pi * 28.6**2) + 6 * 15.9 * ball * 57.2**3,
-        ),
+        (touching, 5.3 * 180 * (body - np.pi * 28.6**2) + 6 * 15.9 * ball * 57.2**3),
         (spheres, 50 * (cylinder - spheres.shapes[1].volume - 6 * ball * 54**3)),
-        (
-            mph.JaszczakPhantom(
-                sphere_diameters=(*none[1:], 186), sphere_ring_radius=0, sphere_height=93, rod_diameters=none
-            ),
-            50 * (cylinder - ball * 186**3),
-        ),
+        (mph.JaszczakPhantom(**single, rod_diameters=none), 50 * (cylinder - ball * 186**3)),
         (mph.DefrisePhantom(4, spacing=8), 100 * 4 * np.pi * 50**2 * 8),
         (mph.PointGrid((2, 1, 3), (5, 0.1, 5), 5), 6 * 100e3),
         (mph.ShapePhantom([SHAPES[0], mph.Sphere(radius=7, activity=-1, mode="add")]), 0),

@@ -61,6 +61,7 @@ MODEL = {
     "model.kind": "emission", "model.time": 600.0, "model.isotope": "Tc-99m", "model.aperture_mu": "tungsten",
     "model.hole": "point",
 }  # fmt: skip
+TRANSMISSION = {**dict.fromkeys(MODEL), "model.kind": "transmission", "reconstruction.method": "sirt"}
 
 
 @pytest.mark.parametrize("suffix", [".h5", ".npz"])
@@ -93,14 +94,12 @@ def test_runs_of_version_0_1_0_reconstruct_when_the_model_is_given(suffix, tmp_p
         ({"model.time": 60.0}, "time 600.0, not 60.0"),
         ({"model.isotope": None, "model.aperture_mu": 3.597170699883768}, "photons_per_decay 0.891, not 1.0"),
         ({"model.hole": None}, "hole point, not auto"),
-        ({"model.kind": "transmission"}, "model emission, not transmission"),
+        (TRANSMISSION, "model emission, not transmission"),
     ],
 )
 def test_a_model_that_the_record_contradicts_is_warned_of(changes, said):
     run = mph.read_run(OLD / "run-0.1.0.npz")
     given = {key: value for key, value in (MODEL | changes).items() if value is not None}
-    if given["model.kind"] == "transmission":
-        given = {"model.kind": "transmission", "reconstruction.method": "sirt"}
     recipe = mph.Recipe({**given, "reconstruction.voxels": 5, "reconstruction.iterations": 1})
     with pytest.warns(mph.InputWarning, match=said):
         mph.reconstruct_run(run, recipe)

@@ -93,7 +93,7 @@ def test_analyze_and_npy(tmp_path, rng, kind):
     assert np.array_equal(volume.grid.affine, turned_grid().affine)
 
 
-def write_meta_image(path: Path, array: np.ndarray, lines: str = "", data: bytes | None = None, **changes: str) -> None:
+def write_meta_image(path: Path, array: np.ndarray, data: bytes | None = None, **changes: str) -> None:
     header = {
         "ObjectType": "Image",
         "NDims": "3",
@@ -109,7 +109,7 @@ def write_meta_image(path: Path, array: np.ndarray, lines: str = "", data: bytes
         **changes,
     }
     header["ElementDataFile"] = header.pop("ElementDataFile")  # the last line
-    text = "".join(f"{key} = {value}\n" for key, value in header.items() if value)
+    text = "".join(f"{key} = {value}\n" for key, value in header.items())
     path.write_bytes(text.encode() + (array.tobytes(order="F") if data is None else data))
 
 
@@ -126,10 +126,8 @@ def test_meta_image_lies_where_itk_puts_it(tmp_path, rng):
     raw = array.astype(">i2").tobytes(order="F")
     (tmp_path / "v.raw").write_bytes(b"12345" + raw)
     for skip in ("5", "-1"):
-        changes = {"BinaryDataByteOrderMSB": "True", "HeaderSize": skip}
-        write_meta_image(tmp_path / "v.mhd", array, data=b"", **changes, ElementDataFile="")
-        with open(tmp_path / "v.mhd", "a") as file:
-            file.write("ElementDataFile = v.raw\n")
+        changes = {"BinaryDataByteOrderMSB": "True", "HeaderSize": skip, "ElementDataFile": "v.raw"}
+        write_meta_image(tmp_path / "v.mhd", array, data=b"", **changes)
         assert np.array_equal(mph.read_volume(tmp_path / "v.mhd").array, array)
 
 
@@ -146,9 +144,7 @@ def test_simpleitk_puts_every_voxel_in_the_same_place(tmp_path, ct, name):
         reader = itk.ImageSeriesReader()
         reader.SetFileNames(reader.GetGDCMSeriesFileNames(str(tmp_path / name)))
         back = reader.Execute()
-        assert np.allclose(
-            back.TransformIndexToPhysicalPoint((1, 2, 3)), image.TransformIndexToPhysicalPoint((1, 2, 3))
-        )
+        assert np.allclose(*(series.TransformIndexToPhysicalPoint((1, 2, 3)) for series in (back, image)))
         assert np.array_equal(itk.GetArrayFromImage(back), itk.GetArrayFromImage(image))
     else:
         itk.WriteImage(image, str(tmp_path / name), useCompression=name == "v.mha")

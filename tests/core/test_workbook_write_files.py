@@ -10,7 +10,9 @@ import subprocess
 import sys
 import time
 import zipfile
+from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +23,7 @@ from openpyxl.comments import Comment
 from openpyxl.drawing.image import Image
 from openpyxl.formatting.rule import ColorScaleRule
 from openpyxl.worksheet.datavalidation import DataValidation
+from openpyxl.worksheet.formula import ArrayFormula
 from openpyxl.worksheet.table import Table
 
 import mphdrr
@@ -36,10 +39,12 @@ from .workbooks import (
     template_content,
     template_workbook,
     values_of,
+    with_centers,
     write_quietly,
 )
 
 SIZES = ("pinhole_diameter", "detector_side", "detector_thickness", "roi_radius")
+SHEETS = "xl/worksheets/sheet"
 SPREADSHEET = "http://schemas.openxmlformats.org/spreadsheetml/2006/main"
 
 
@@ -57,9 +62,14 @@ def infos_of(path: Path) -> list[tuple]:
 
 
 def moved(system: mph.PinholeSystem) -> mph.PinholeSystem:
-    centers = system.centers.copy()
-    centers[1] *= 1.03
-    return by_design(replace(system, centers=centers))
+    return with_centers(system, 1, system.centers[1] * 1.03)
+
+
+def write_template(folder: Path, content: bytes, name: str, edit: Callable[[bytes], bytes]) -> Path:
+    """Write a workbook, its members whose names begin with `name` edited, and return its path."""
+    path = folder / "t.xlsx"
+    path.write_bytes(repacked(content, lambda member, data: edit(data) if member.startswith(name) else data))
+    return path
 
 
 @pytest.fixture
@@ -210,14 +220,10 @@ def plain_written(tmp_path_factory):
 
 @pytest.mark.parametrize("odd", ODD)
 def test_odd_xml_is_patched_in_place(odd, plain_written, tmp_path):
-    def edit(name: str, data: bytes) -> bytes:
-        if not name.startswith("xl/worksheets/sheet"):
-            return data
-        return ODD[odd](data.decode()).encode()
-
     system, expected = plain_written
-    template = tmp_path / "t.xlsx"
-    template.write_bytes(repacked(template_content(seed=11), edit))
+    template = write_template(
+        tmp_path, template_content(seed=11), SHEETS, lambda data: ODD[odd](data.decode()).encode()
+    )
     written = write_quietly(system, tmp_path / "o.xlsx", template)
     for data_only in (True, False):
         assert values_of(written.path, data_only) == values_of(expected.path, data_only)
@@ -226,37 +232,29 @@ def test_odd_xml_is_patched_in_place(odd, plain_written, tmp_path):
 
 @pytest.mark.parametrize("encoding", UNREADABLE)
 def test_xml_in_another_encoding_than_utf_8_is_refused(encoding, tmp_path):
-    def edit(name: str, data: bytes) -> bytes:
-        return UNREADABLE[encoding](data.decode()) if name.startswith("xl/worksheets/sheet") else data
-
-    template = tmp_path / "t.xlsx"
-    template.write_bytes(repacked(template_content(seed=11), edit))
+    content = template_content(seed=11)
+    template = write_template(tmp_path, content, SHEETS, lambda data: UNREADABLE[encoding](data.decode()))
     with pytest.raises(mph.InputError, match="not readable XML"):
         mph.read_system(template)
 
 
 def test_a_list_of_sheets_of_another_kind_is_refused(tmp_path):
-    def edit(name: str, data: bytes) -> bytes:
-        return data.replace(SPREADSHEET.encode(), b"urn:other") if name == "xl/workbook.xml" else data
-
-    template = tmp_path / "t.xlsx"
-    template.write_bytes(repacked(template_content(seed=11), edit))
+    content, spreadsheet = template_content(seed=11), SPREADSHEET.encode()
+    template = write_template(
+        tmp_path, content, "xl/workbook.xml", lambda data: data.replace(spreadsheet, b"urn:other")
+    )
     with pytest.raises(mph.InputError, match=r"t\.xlsx: .* its sheets are none"):
         write_quietly(moved(read_quietly(template)), tmp_path / "o.xlsx", template)
 
 
 def test_texts_that_were_numbers_in_formulas_and_cells_of_any_type_become_numbers(tmp_path):
-    content = template_content(seed=2, derived="absent", length="absent")
-
-    def edit(name: str, data: bytes) -> bytes:
-        if name != "xl/worksheets/sheet2.xml":
-            return data
+    def edit(data: bytes) -> bytes:
         data = re.sub(rb'<c r="A3"[^>]*><v>(\d+)</v></c>', rb'<c r="A3" t="inlineStr"><is><t>\1</t></is></c>', data)
         data = re.sub(rb'<c r="A4"[^>]*><v>(\d+)</v></c>', rb'<c r="A4" t="str"><f>"\1"</f><v>\1</v></c>', data)
         return re.sub(rb'<c r="B3"[^>]*><v>([^<]*)</v></c>', rb'<c r="B3" t="n"><f>\1+0</f><v>\1</v></c>', data)
 
-    template = tmp_path / "t.xlsx"
-    template.write_bytes(repacked(content, edit))
+    content = template_content(seed=2, derived="absent", length="absent")
+    template = write_template(tmp_path, content, f"{SHEETS}2", edit)
     system = read_quietly(template)
     copy = write_quietly(system, tmp_path / "o.xlsx", template)
     assert copy.path.read_bytes() == template.read_bytes()
@@ -268,11 +266,8 @@ def test_texts_that_were_numbers_in_formulas_and_cells_of_any_type_become_number
 
 def test_the_other_cells_keep_a_shared_formula(tmp_path):
     """x1 = 3, 5 and so on by one shared formula whose first cell, then second, is overwritten."""
-    content = template_content(seed=2)
 
-    def edit(name: str, data: bytes) -> bytes:
-        if name != "xl/worksheets/sheet2.xml":
-            return data
+    def edit(data: bytes) -> bytes:
         for row in range(3, 7):
             formula = b"<f t='shared' ref='B3:B6' si='0'>100+C3*0.5</f>" if row == 3 else b'<f t="shared" si="0"/>'
             y = float(re.search(rb'<c r="C%d"[^>]*><v>([^<]*)' % row, data)[1])
@@ -280,12 +275,10 @@ def test_the_other_cells_keep_a_shared_formula(tmp_path):
             data = re.sub(rb'<c r="B%d"[^>]*><v>[^<]*</v></c>' % row, new, data)
         return data
 
-    template = tmp_path / "t.xlsx"
-    template.write_bytes(repacked(content, edit))
+    template = write_template(tmp_path, template_content(seed=2), f"{SHEETS}2", edit)
     system = read_quietly(template)
-    centers = system.centers.copy()
-    centers[0, 0] += 1
-    written = write_quietly(by_design(replace(system, centers=centers)), tmp_path / "o.xlsx", template)
+    shifted = with_centers(system, (0, 0), system.centers[0, 0] + 1)
+    written = write_quietly(shifted, tmp_path / "o.xlsx", template)
     formulas = values_of(written.path, data_only=False)
     assert [formulas["Coordinates", f"B{row}"] for row in range(4, 7)] == [f"=100+C{row}*0.5" for row in range(4, 7)]
     # And sorted, and removed.
@@ -296,20 +289,9 @@ def test_the_other_cells_keep_a_shared_formula(tmp_path):
 
 def test_cells_of_array_formulas_do_not_change_alone(tmp_path):
     book = template_workbook(TemplateLayout(seed=2, length="absent", derived="absent"))
-    from openpyxl.worksheet.formula import ArrayFormula
-
-    template = tmp_path / "t.xlsx"
     book["Coordinates"]["B3"] = ArrayFormula("B3:B4", "=Z3:Z4*1")
-    content = content_of(book)
-    content = repacked(
-        content,
-        lambda name, data: (
-            re.sub(rb'(<c r="B3".*?</f>)<v ?/?>(</v>)?', rb"\g<1><v>150.5</v>", data)
-            if name == "xl/worksheets/sheet2.xml"
-            else data
-        ),
-    )
-    template.write_bytes(content)
+    stored = partial(re.sub, rb'(<c r="B3".*?</f>)<v ?/?>(</v>)?', rb"\g<1><v>150.5</v>")
+    template = write_template(tmp_path, content_of(book), f"{SHEETS}2", stored)
     system = read_quietly(template)
     with pytest.raises(mph.InputError, match=r"Coordinates!B4 is one cell of the array formula or data table B3:B4"):
         mph.write_system(moved(system), tmp_path / "o.xlsx", template)
@@ -374,9 +356,8 @@ def test_formulas_of_tables_store_no_value_if_the_table_changes(tmp_path):
         other.append(row)
     other.add_table(Table(displayName="Apart", ref="A1:B3"))
     other["D1"], other["D2"], other["D3"] = "=SUM(Apart[a '[b']])", "=SUM(Pins[x1])", "=D2+1"
-    template = tmp_path / "t.xlsx"
-    stored = re.compile(rb"(<f>(SUM|D2).*?</f>)<v ?(/>|></v>)")
-    template.write_bytes(repacked(content_of(book), lambda name, data: stored.sub(rb"\1<v>77</v>", data)))
+    stored = partial(re.sub, rb"(<f>(SUM|D2).*?</f>)<v ?(/>|></v>)", rb"\1<v>77</v>")
+    template = write_template(tmp_path, content_of(book), SHEETS, stored)
     written = write_quietly(moved(read_quietly(template)), tmp_path / "o.xlsx", template)
     values = values_of(written.path)
     assert values["Other", "D1"] == 77  # as stored before: nothing that it refers to has changed
@@ -407,14 +388,12 @@ while True:
 def test_killed_at_any_moment_the_old_or_the_new_file_is_whole(times, tmp_path, rng):
     workbook = saved_template(tmp_path / "a.xlsx", seed=6)
     a = read_quietly(workbook)
-    centers = a.centers.copy()
-    centers[:, 0] += 0.5
-    b = by_design(replace(a, centers=centers))
+    b = with_centers(a, (slice(None), 0), a.centers[:, 0] + 0.5)
     write_quietly(b, tmp_path / "b.xlsx", workbook)
     path = tmp_path / "master.xlsx"
     path.write_bytes(workbook.read_bytes())
-    environment = {**os.environ, "PYTHONPATH": str(Path(mphdrr.__file__).parents[1]) if mphdrr.__file__ else ""}
-    environment["PYTHONPATH"] = os.pathsep.join([environment["PYTHONPATH"], *sys.path])
+    package = str(Path(mphdrr.__file__).parents[1]) if mphdrr.__file__ else ""
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([package, *sys.path])}
     for _ in range(times):
         process = subprocess.Popen(
             [sys.executable, "-c", _LOOP, str(path), str(workbook), str(tmp_path / "b.xlsx")],

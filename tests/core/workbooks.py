@@ -42,6 +42,13 @@ def by_design(system: PinholeSystem) -> PinholeSystem:
     return replace(s, collimator_length=length)
 
 
+def with_centers(system: PinholeSystem, part, values) -> PinholeSystem:
+    """Return the system with `values` in place of `system.centers[part]`, and its collimators designed for them."""
+    centers = system.centers.copy()
+    centers[part] = values
+    return by_design(replace(system, centers=centers))
+
+
 def read_quietly(path) -> PinholeSystem:
     """Return the system in a file, without its warnings."""
     with warnings.catch_warnings():

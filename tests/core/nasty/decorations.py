@@ -36,17 +36,8 @@ IN_MM = {"order": TYPED, "unit": "", "units_of": "all"}
 TWO_SHEETS = {"second": "sheet", "once": "", "shuffled": False}
 CALCULATED = {**IN_MM, **TWO_SHEETS, "formulas": "stored"}
 NUMBERED = {"modules": 4, "labels": ("numbers", "numbers"), "number": "No."}
-AT_THE_CORNER = {
-    "modules": 4,
-    "top": 0,
-    "left": 0,
-    "gap": 0,
-    "under": 0,
-    "formulas": "",
-    "second": "",
-    "once": "",
-    "style": "symbols",
-}
+AT_THE_CORNER = {"modules": 4, "style": "symbols", **dict.fromkeys(("top", "left", "gap", "under"), 0)}
+AT_THE_CORNER |= dict.fromkeys(("formulas", "second", "once"), "")
 USERS_SHEETS = {"sheets": ("Coordinates", "Main")}
 """What layouts must be like for several decorations."""
 
@@ -90,24 +81,21 @@ def _convert(draft: Draft, names: list[str], unit: str) -> None:
 # Texts
 
 WORDS = {
-    "cm": ("cm", "in cm", "all lengths in cm", "Units: cm", "[cm]", "1 unit = 10 mm", "cm!"),
-    "in": ("inches", "Maße in Zoll", "Unit = inch", '(")'),
-    "m": ("m", "all in metres"),
-    "dm": ("dm",),
-    "0.1 mm": ("tenths of a mm", "0.1 mm"),
-    "ft": ("feet",),
-    NOBODY: ("Unit: Elle", "scale 1:10"),
-    "near": ("half values", "mirrored: swap the sign of x", "values x 10", "old", "× 0.1", "nominal"),
-    SAME: (
-        "mm",
-        "lengths in mm",
-        "DC-SPECT, 80 modules",
-        "2021-03-04",
-        "R: ROI",
-        "measured in 2021 by CMM",
-        "OBSOLETE",
-    ),
+    "cm": "cm|in cm|all lengths in cm|Units: cm|[cm]|1 unit = 10 mm|cm!",
+    "in": 'inches|Maße in Zoll|Unit = inch|(")',
+    "m": "m|all in metres",
+    "dm": "dm",
+    "0.1 mm": "tenths of a mm|0.1 mm",
+    "ft": "feet",
+    NOBODY: "Unit: Elle|scale 1:10",
+    "near": "half values|mirrored: swap the sign of x|values x 10|old|× 0.1|nominal",
+    SAME: "mm|lengths in mm|DC-SPECT, 80 modules|2021-03-04|R: ROI|measured in 2021 by CMM|OBSOLETE",
 }
+ANYWHERE = (
+    "beside the headings|beside the modules|a column|heading of the numbers|below|far below|name of the sheet|"
+    "note of a heading|note of a number|another sheet"
+)
+"""Places that every layout has."""
 WHERE = {
     "title": {"top": 2},
     "pair": {"top": 2},
@@ -119,16 +107,7 @@ WHERE = {
     "far over every heading": {"top": 2, "second": "sheet"},
     "under every heading": {"under": 1},
     "between headings": {"apart": 1, "style": "both"},
-    "beside the headings": {},
-    "beside the modules": {},
-    "a column": {},
-    "heading of the numbers": {},
-    "below": {},
-    "far below": {},
-    "name of the sheet": {},
-    "note of a heading": {},
-    "note of a number": {},
-    "another sheet": {},
+    **{where: {} for where in ANYWHERE.split("|")},
 }
 
 
@@ -204,7 +183,9 @@ def text(draft: Draft, where: str, words: str, meaning: str) -> None:
 
 for _i, (_where, _needs) in enumerate(WHERE.items()):
     _near = re.search("^(band|over|under|between)", _where)
-    _pairs = [(words, meaning) for meaning, texts in WORDS.items() for words in texts if _near or meaning != "near"]
+    _pairs = [
+        (words, meaning) for meaning, texts in WORDS.items() for words in texts.split("|") if _near or meaning != "near"
+    ]
     for _words, _meaning in _pairs[_i % 4 :: 4]:
         if _where == "a column" and " in " in _words:
             continue  # a sentence in each row is no unit of a column
@@ -213,23 +194,14 @@ for _i, (_where, _needs) in enumerate(WHERE.items()):
 
 # Number formats
 
+MIXED_FORMATS = ('0.00" mm";-0.00" cm"', '0.00" mm (cm)"', '0.00;-0.00" cm"')
 FORMATS = {
     "plain": ("0.00", "0.000E+00", "[$-409]0.0", "0.0_m", "[Red]0.0;[Blue]-0.0", "@", "#,##0.00", 4),
     "plain too": ('_(* #,##0.00_);_(* \\(#,##0.00\\);_(* "-"??_);_(@_)',),
     SAME: ('0.0" mm"', "0.0\\ \\m\\m"),
     "cm": ('0.00" cm"', "0.0\\ \\c\\m", '0.00" cm";-0.00" cm"', '[>100]0.0" cm";0.000" cm"', "[$cm] 0.00"),
     "in": ('0.0"″"', '0.0##\\"', '0.0" Zoll"'),
-    NOBODY: (
-        "0.0,",
-        '"-"0.0',
-        '0.00" k"',
-        "0.00%",
-        "0‰",
-        10,
-        '0.00" mm";-0.00" cm"',
-        '0.00" mm (cm)"',
-        '0.00;-0.00" cm"',
-    ),
+    NOBODY: ("0.0,", '"-"0.0', '0.00" k"', "0.00%", "0‰", 10, *MIXED_FORMATS),
     BROKEN: ("yyyy-mm-dd", "mm:ss", 14, 45),
 }
 
@@ -249,9 +221,8 @@ def number_format(draft: Draft, code: str | int, meaning: str, scope: str) -> No
         meaning = SAME
     elif (scope == "a cell" and meaning not in (SAME, BROKEN)) or (meaning == SAME and says != {"mm"}):
         meaning = NOBODY
-    mean(
-        draft, meaning, names, *(f"{draft.table(name).sheet.name}!{draft.table(name).columns[name]}" for name in names)
-    )
+    tables = [(name, draft.table(name)) for name in names]
+    mean(draft, meaning, names, *(f"{table.sheet.name}!{table.columns[name]}" for name, table in tables))
 
 
 add(number_format, '0.00" cm"', "cm", "all", unit="cm", units_of="all")
@@ -265,24 +236,17 @@ for _meaning, _codes in FORMATS.items():
 # Headings
 
 FORMS = {
-    "cm": (
-        "{} (cms)",
-        "cm {}",
-        "{} (\N{SQUARE CM})",
-        "{}\N{ZERO WIDTH SPACE}(cm)",
-        "{} (c\N{SOFT HYPHEN}m)",
-        "{} (厘米)",
-    ),
-    "cm too": ("{} (cm) nominal", "{} (10 mm)", "{} ×10 (mm)", "{} (mm) in cm", "{} cm", "{} (cm), cm"),
-    "in": ('{} (")', "{} (Zoll)"),
-    SAME: ("{}_mm", "{}, mm", "{} (mm, not cm)", " {} ", "{}:", "'{}'", "{} ¹⁾", "{}\N{ZERO WIDTH SPACE}"),
-    "dm": ("{} (dm)",),
-    "0.1 mm": ("{} (0,1 mm)", "{} (mm × 0.1)"),
-    "mil": ("{} (mils)",),
-    "ft": ("{} (')",),
-    "voxel": ("{} (voxels)", "{} (%)", "{} (cm²)", "{} (?)"),
-    NOBODY: ("{} (old)", "tolerance of {}", "half {}", "{} nominal", "{}²", "{} (cm, CAD)", "{} × 10", "Δ{}", "{}/2"),
-    "nobody too": ("{}, mm or cm", "{} of window", "-{}", "{} (±)", "{}/b", "{}, mirrored", "{}0", "{} (max)", "{}*"),
+    "cm": "{} (cms)|cm {}|{} (\N{SQUARE CM})|{}\N{ZERO WIDTH SPACE}(cm)|{} (c\N{SOFT HYPHEN}m)|{} (厘米)",
+    "cm too": "{} (cm) nominal|{} (10 mm)|{} ×10 (mm)|{} (mm) in cm|{} cm|{} (cm), cm",
+    "in": '{} (")|{} (Zoll)',
+    SAME: "{}_mm|{}, mm|{} (mm, not cm)| {} |{}:|'{}'|{} ¹⁾|{}\N{ZERO WIDTH SPACE}",
+    "dm": "{} (dm)",
+    "0.1 mm": "{} (0,1 mm)|{} (mm × 0.1)",
+    "mil": "{} (mils)",
+    "ft": "{} (')",
+    "voxel": "{} (voxels)|{} (%)|{} (cm²)|{} (?)",
+    NOBODY: "{} (old)|tolerance of {}|half {}|{} nominal|{}²|{} (cm, CAD)|{} × 10|Δ{}|{}/2",
+    "nobody too": "{}, mm or cm|{} of window|-{}|{} (±)|{}/b|{}, mirrored|{}0|{} (max)|{}*",
 }
 OTHER_QUANTITIES = {
     "d": "radius of pinhole|outer diameter of pinhole insert|half diameter of pinhole|D",
@@ -374,7 +338,7 @@ def groups(draft: Draft, own: str, other: str, names: str, meaning: str) -> None
 
 
 for _meaning, _forms in FORMS.items():
-    for _form, _name in zip(_forms, cycle(("x1", "d", "l")), strict=False):
+    for _form, _name in zip(_forms.split("|"), cycle(("x1", "d", "l")), strict=False):
         add(heading, _name, _form, _meaning.removesuffix(" too"), order=TYPED, headings="others")
         if not _meaning.startswith(NOBODY):
             add(heading, "x1", _form, _meaning.removesuffix(" too"), True, headings="others")
@@ -387,16 +351,8 @@ for _i, _form in enumerate(form for form in SPELLINGS if form != "without its un
     _column = ("x1", "z1")[_i % 2] if _i > 2 else "l"
     add(heading, _column, _form, _meaning, order=TYPED, style=_style, formulas="", headings="others")
 add(heading, "x1", "see drawing 12", NOBODY, style="both", headings="others")
-add(
-    heading,
-    "x1",
-    "without its unit",
-    NOBODY,
-    **{**USUAL, "headings": "others"},
-    unit="cm",
-    units_of="all",
-    unit_form="{} ({})",
-)
+_needs = {"unit": "cm", "units_of": "all", "unit_form": "{} ({})", "style": "symbols", "headings": "others"}
+add(heading, "x1", "without its unit", NOBODY, **_needs)
 for _form in ("{} (cm)", "{}, in cm!"):
     add(heading, "x1", _form, "cm", style="both", unit="mm", unit_in="symbol", units_of="all", headings="others")
 for _form in ("none", "merged across", "merged down", "merged over its own"):
@@ -433,21 +389,11 @@ def further_column(draft: Draft, name: str, head: str, meaning: str, own: str = 
 
 
 HARMLESS = ("serial", "S", "3D slope", "weight (kg)", "note", "sensitivity (cps/MBq)", "S2")
-BESIDE = (
-    "side of the patient",
-    "x1 error",
-    "half diameter of pinhole",
-    "material of collimator",
-    "z1 limit (cm)",
-    "D",
-    "B",
-    "x2",
-    "ring",
-)
+BESIDE = "side of the patient|x1 error|half diameter of pinhole|material of collimator|z1 limit (cm)|D|B|x2|ring"
 SECOND = ("{0}", "{0} new", "{0} (measured)", "{1}", "{1} (cm)", "{0}_corr", "{0} [mm]", "{1} (surveyed)", "{0}*")
 for _head in HARMLESS:
     add(further_column, "y1", _head, SAME)
-for _head in (*BESIDE, "principal ray z axis", "width of the gap, cm", "azimuth of the cable"):
+for _head in (*BESIDE.split("|"), "principal ray z axis", "width of the gap, cm", "azimuth of the cable"):
     add(further_column, "d", _head, SAME, second="")
 for _head, _name in zip(SECOND, cycle(("x1", "l", "d", "R")), strict=False):
     add(further_column, _name, _head, NOBODY, second="", formulas="", order=TYPED)
@@ -541,14 +487,8 @@ def rows(draft: Draft, kind: str, where: str, gap: int) -> None:
     elif where == "beside":
         right, row = column_index_from_string(draft.free(3)), table.row + gap
     places = [_written(draft, table, row + k, *entry, k, right) for k, entry in enumerate(ROWS[kind])]
-    # Rows like those of modules may be some.
-    mean(
-        draft,
-        NOBODY if kind in ("without numbers", "typed means") else SAME,
-        (),
-        *places,
-        *(t.sheet.name for t in draft.tables),
-    )
+    meaning = NOBODY if kind in ("without numbers", "typed means") else SAME  # rows like those of modules may be some
+    mean(draft, meaning, (), *places, *(t.sheet.name for t in draft.tables))
 
 
 for _i, _kind in enumerate(ROWS):
@@ -577,19 +517,9 @@ for _mark, _fill, _meaning in (
     *((None, None, SAME), ("ring 2", None, SAME), ("No.", "headings", SAME), (None, {"x1": "y1", "y1": "x1"}, NOBODY)),
     *(("removed:", None, NOBODY), ("mean", "AVERAGE({0}:{1})", NOBODY)),
 ):
-    for _labels in (("numbers", "numbers"), ("", "")):
-        _second = ("", "sheet")[_labels[0] == ""]
-        add(
-            between,
-            _mark,
-            _fill,
-            _meaning,
-            **USUAL,
-            **{**TWO_SHEETS, "second": _second},
-            modules=4,
-            formulas="",
-            labels=_labels,
-        )
+    for _label, _second in (("numbers", ""), ("", "sheet")):
+        _needs = {**USUAL, **TWO_SHEETS, "second": _second, "labels": (_label, _label)}
+        add(between, _mark, _fill, _meaning, **_needs, modules=4, formulas="")
 
 
 def filled_down(draft: Draft) -> None:
@@ -663,25 +593,17 @@ def _labelled(table: Table, column: str, head: str, values: list[Any]) -> None:
         table.sheet[f"{column}{row}"] = value
 
 
-for _kind in ("twice", "missing", "spare", "stale"):
+LAST_LABEL = ("twice", "missing", "spare", "stale")
+for _kind in LAST_LABEL:
     add(labels, _kind, **NUMBERED, second="", once="")
-for _kind in (
-    "twice",
-    "missing",
-    "spare",
-    "stale",
-    "others",
-    "a ring",
-    "a second column",
-    "serials",
-    "serials at odds",
-):
+for _kind in (*LAST_LABEL, "others", "a ring", "a second column", "serials", "serials at odds"):
     add(labels, _kind, **NUMBERED, second="sheet", once="")
 add(labels, "serials at odds", second="sheet", modules=4, once="", labels=("", ""))
 
 
 # Cells
 
+TEXTS = '12,5|1.{:.0f},0|1 {:.0f}|{:g} mm|{:g} ± 0.1|({:g})|3l5|n/a|NaN|"|TRUE|?|see above|1e3x| |=B2'
 CELLS: dict[str, tuple[Callable[[float, str], Any], str]] = {
     "as text": (lambda v, at: f"{v:.15g}", UNMAPPED),
     "as text with an exponent": (lambda v, at: f" {v:.15e} ", UNMAPPED),
@@ -694,25 +616,7 @@ CELLS: dict[str, tuple[Callable[[float, str], Any], str]] = {
     "CDATA in the value": (lambda v, at: Raw(f'<c r="{at}"><v><![CDATA[{v!r}]]></v></c>'), SAME),
     "a comment in the value": (lambda v, at: Raw(f'<c r="{at}"><v>{repr(v)[:2]}<!-- x -->{repr(v)[2:]}</v></c>'), SAME),
     "stored twice alike": (lambda v, at: Raw(f'<c r="{at}"><v>{v!r}</v></c>' * 2), UNMAPPED),
-    **{
-        f"text {text!r}": (lambda v, at, text=text: text.format(v), BROKEN)
-        for text in (
-            "12,5",
-            "1.{:.0f},0",
-            "1 {:.0f}",
-            "{:g} mm",
-            "{:g} ± 0.1",
-            "({:g})",
-            "3l5",
-            "n/a",
-            "NaN",
-            '"',
-            "TRUE",
-        )
-    },
-    **{
-        f"text {text!r} too": (lambda v, at, text=text: text, BROKEN) for text in ("?", "see above", "1e3x", " ", "=B2")
-    },
+    **{f"text {text!r}": (lambda v, at, text=text: text.format(v), BROKEN) for text in TEXTS.split("|")},
     **{
         f"value {value!r}": (lambda v, at, value=value: value, BROKEN)
         for value in (True, None, Error("#N/A"), 1e300, -1.0, 0.0)
@@ -748,12 +652,8 @@ def merged_modules(draft: Draft, name: str, down: bool) -> None:
     """Numbers hidden under a merged cell."""
     table = draft.table(name)
     column, after = table.columns[name], table.columns[TYPED[TYPED.index(name) + 1]]
-    area = (
-        f"{column}{table.rows[0]}:{column}{table.rows[-1]}"
-        if down
-        else f"{column}{table.rows[0]}:{after}{table.rows[0]}"
-    )
-    table.sheet.merged.append(area)
+    last = f"{column}{table.rows[-1]}" if down else f"{after}{table.rows[0]}"
+    table.sheet.merged.append(f"{column}{table.rows[0]}:{last}")
     mean(draft, NOBODY, (), f"{table.sheet.name}!{column}", f"{table.sheet.name}!{after}")
 
 
@@ -1017,7 +917,6 @@ def further_sheet(draft: Draft, name: str, kind: str, state: str) -> None:
         pairs = [[SYMBOLS[q], DESCRIPTIONS[q]] for q in DESCRIPTIONS]
         sheet = Sheet(name)
         sheet.put("A1", pairs if kind.endswith("down") else [list(row) for row in zip(*pairs, strict=True)])
-        meaning = SAME
     elif kind == "plot":
         sheet = Sheet(name, {"A1": "x1", "B1": "y1"})
         for k, (x, y) in enumerate(zip(draft.cells("x1"), draft.cells("y1"), strict=True), start=2):

@@ -55,6 +55,6 @@ class MPHDRR_OT_mesh_from_volume(jobs.JobOperator, bpy.types.Operator):
 
 
 def _chosen(context: bpy.types.Context) -> list[bpy.types.Object]:
-    """Return the selected mesh objects, except the scanner's parts, sorted by name."""
-    objects = [item for item in context.selected_objects if item.type == "MESH" and item.mphdrr_module.part == "NONE"]
-    return sorted(objects, key=lambda item: item.name)
+    """Return the selected mesh objects and instanced collections, except the scanner's parts, sorted by name."""
+    items = [item for item in context.selected_objects if item.type == "MESH" or item.instance_collection]
+    return sorted((item for item in items if item.mphdrr_module.part == "NONE"), key=lambda item: item.name)

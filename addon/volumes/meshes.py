@@ -26,7 +26,7 @@ def voxelize_job(
     voxel_size: float = 0.0,
     name: str = "",
 ) -> jobs.Job:
-    """Return the job that makes a volume of closed mesh objects, modifiers included.
+    """Return the job that makes a volume of closed mesh objects, modifiers and instances included.
 
     A voxel at a surface holds the value times the fraction of the voxel that is covered. Later items replace earlier ones
     where they overlap. The `value` inside is in the unit of the `quantity`, "activity" or "mu"; an object's custom property
@@ -35,8 +35,9 @@ def voxelize_job(
     """
     if not items:
         raise InputError("no mesh object is selected: select closed meshes first")
-    values = [float(item.get(quantity, value)) for item in items]
-    solids = evaluated_meshes(items, bpy.context.evaluated_depsgraph_get())
+    meshes_of_items = evaluated_meshes(items, bpy.context.evaluated_depsgraph_get())
+    values = [float(item.get(quantity, value)) for item, meshes in meshes_of_items for _ in meshes]
+    solids = [mesh for _, meshes in meshes_of_items for mesh in meshes]
     vertices = np.concatenate([solid.vertices for solid in solids])
     spacing = voxel_size or float(np.ptp(vertices, axis=0).max()) / max(1, voxels - 2)
     grid = grid_around(vertices, spacing)
@@ -79,27 +80,46 @@ def mesh_job(item: bpy.types.Object, level: float | None = None) -> jobs.Job:
     return jobs.Job("Mesh from volume", work, finish)
 
 
-def evaluated_meshes(items: Sequence[bpy.types.Object], depsgraph: bpy.types.Depsgraph) -> list[Mesh]:
-    """Return objects as meshes, modifiers included, in world mm; `InputError` names one without faces or an open one."""
-    meshes = []
+def evaluated_meshes(
+    items: Sequence[bpy.types.Object], depsgraph: bpy.types.Depsgraph
+) -> list[tuple[bpy.types.Object, list[Mesh]]]:
+    """Return objects with their meshes as Blender shows them, in world mm: modifiers and instances included.
+
+    `InputError` names an object without faces, or with an open mesh.
+    """
+    meshes: dict[bpy.types.Object, list[Mesh]] = {item: [] for item in items}
     for item in items:
-        evaluated = item.evaluated_get(depsgraph)
-        mesh = evaluated.to_mesh()
-        try:
-            mesh.calc_loop_triangles()
-            points = np.empty((len(mesh.vertices), 3), np.float32)
-            mesh.vertices.foreach_get("co", points.ravel())
-            faces = np.empty((len(mesh.loop_triangles), 3), np.int32)
-            mesh.loop_triangles.foreach_get("vertices", faces.ravel())
-        finally:
-            evaluated.to_mesh_clear()
-        pose = objects.world_matrix(item)
-        if np.linalg.det(pose[:3, :3]) < 0:  # a mirrored object shows the other side of its faces
-            faces = faces[:, ::-1]
-        with naming(repr(item.name)):
-            meshes.append(Mesh(points.astype(np.float64) @ pose[:3, :3].T + pose[:3, 3], faces.astype(np.int64)))
-            require_closed(meshes[-1])
-    return meshes
+        if item.type == "MESH" and (not item.is_instancer or item.show_instancer_for_viewport):
+            meshes[item] += _closed_meshes(item.evaluated_get(depsgraph), objects.world_matrix(item), item.name)
+    for instance in depsgraph.object_instances:
+        owner = instance.parent.original if instance.is_instance and instance.parent else None
+        if owner in meshes and instance.object.type == "MESH":
+            meshes[owner] += _closed_meshes(instance.object, np.array(instance.matrix_world, np.float64), owner.name)
+    for item, item_meshes in meshes.items():
+        if not item_meshes:
+            raise InputError(f"{item.name!r}: the mesh has no faces")
+    return list(meshes.items())
+
+
+def _closed_meshes(evaluated: bpy.types.Object, pose: NDArray[np.float64], name: str) -> list[Mesh]:
+    """Return the mesh of an evaluated object at a pose (4, 4), mm, in a list; it is empty for an object without faces."""
+    mesh = evaluated.to_mesh()
+    try:
+        mesh.calc_loop_triangles()
+        points = np.empty((len(mesh.vertices), 3), np.float32)
+        mesh.vertices.foreach_get("co", points.ravel())
+        faces = np.empty((len(mesh.loop_triangles), 3), np.int32)
+        mesh.loop_triangles.foreach_get("vertices", faces.ravel())
+    finally:
+        evaluated.to_mesh_clear()
+    if not len(faces):
+        return []
+    if np.linalg.det(pose[:3, :3]) < 0:  # a mirrored object shows the other side of its faces
+        faces = faces[:, ::-1]
+    with naming(repr(name)):
+        result = Mesh(points.astype(np.float64) @ pose[:3, :3].T + pose[:3, 3], faces.astype(np.int64))
+        require_closed(result)
+    return [result]
 
 
 def add_mesh(mesh: Mesh, name: str, pose: NDArray[np.float64], collection: bpy.types.Collection) -> bpy.types.Object:

@@ -436,15 +436,15 @@ class Emission(Model):
         effects = [DirectionalEffects.from_optics(self._optics_of(m), *size) for m, size in enumerate(sizes)]
         lengths = self.system.collimator_length + [module.mean_depth for module in effects]
 
-        def ray_weight(m: int, *, u: Floats, v: Floats) -> Floats:
-            """Return the expected counts per mm^2 of crystal of module m's rays to (v, u), mm from the hole's foot."""
-            (opening,) = plain.openings(m, 1)
-            # The law depends on u^2 + v^2 alone; in the order v, u the sum has the last digit of earlier versions.
-            return plain.pixel_weights(m, v, u, (1.0, 1.0), float(lengths[m]), opening)
-
-        modules = self._frames, lengths, plain.effective_diameter, sides, ray_weight
+        modules = self._frames, lengths, plain.effective_diameter, sides, partial(plain._ray_weight, lengths)
         settings: Any = self.mu, self.hole == "depth", None if self.has_one_kernel else effects
         return PinholeOperator(views, grid, *modules, *settings)
+
+    def _ray_weight(self, lengths: Floats, m: int, *, u: Floats, v: Floats) -> Floats:
+        """Return the expected counts per mm^2 of crystal, at `lengths` (M,), of module m's rays to (v, u), mm, on it."""
+        (opening,) = self.openings(m, 1)
+        # The law depends on u^2 + v^2 alone; in the order v, u the sum has the last digit of earlier versions.
+        return self.pixel_weights(m, v, u, (1.0, 1.0), float(lengths[m]), opening)
 
     def caution(self, views: Views, grid: Grid) -> str | None:
         """Return a warning if there are too few rays for the tolerance, or None."""

@@ -25,7 +25,7 @@ _SAME_RESULT = 1e-6
 SAVING = "opening the workbook in Excel or LibreOffice and saving it"
 
 _OLE = bytes.fromhex("d0cf11e0a1b11ae1")
-_ENCRYPTED = "EncryptedPackage".encode("utf-16-le")
+_XLS_STREAMS = tuple(name.encode("utf-16-le") for name in ("Workbook", "Book"))
 
 
 class OutdatedValue(NamedTuple):
@@ -62,12 +62,12 @@ class Book:
 
     def _stored_or_computed(self, address: Address, computed: Any) -> Any:
         """Return the computed value of a formula, or if there is none, its stored value where that can be relied on."""
-        stored = self._cell(address).value
+        stored, asks_for_calculation = self._cell(address).value, self.workbook.asks_for_calculation
         if not isinstance(computed, UncomputedValue) or stored is None:
             return computed
-        if stored in (0, "") and (self.workbook.asks_for_calculation or self.workbook.was_never_calculated):
+        if stored in (0, "") and (asks_for_calculation or self.workbook.was_never_calculated):
             return UncomputedValue(f"it stores {stored!r}, as programs do that calculate nothing, and {computed}")
-        if self.workbook.asks_for_calculation:
+        if asks_for_calculation:
             self.unverified[address] = str(computed)
         return stored
 
@@ -211,7 +211,7 @@ def _describe_other_format(name: str, content: bytes) -> str | None:
     """Return for a message what a file is instead of an .xlsx workbook, None if it may be a workbook."""
     if name.startswith("~$"):
         return f"this is Excel's lock file, expected the workbook {name[2:]}"
-    if content.startswith(_OLE) and _ENCRYPTED in content:
+    if content.startswith(_OLE) and not any(name in content for name in _XLS_STREAMS):
         return "the workbook is protected by a password, expected one saved without it"
     if content.startswith(_OLE):
         return "an old Excel .xls file (or another OLE document), expected it saved as .xlsx"

@@ -18,6 +18,7 @@ MAX_ROW, MAX_COLUMN = 1_048_576, 16_384
 Position = tuple[int, int]
 """Row and column of a cell, counted from 1."""
 
+_ESCAPE = re.compile("_x([0-9A-Fa-f]{4})_")
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
 
 _SHEET = re.compile(r"'((?:[^'\[\]]|'')+)'|[^'!\[\]()\s]+")
@@ -363,7 +364,7 @@ def _read_value(cell_type: str, children: dict[str, Element], strings: list[str]
         return None
     text = children["v"].text
     if cell_type == "str":
-        return text
+        return unescaped(text)
     text = text.strip()
     if not text:
         return None
@@ -382,7 +383,12 @@ def _read_value(cell_type: str, children: dict[str, Element], strings: list[str]
 def _rich_text(element: Element) -> str:
     """Return the text of a string's runs, without phonetic hints."""
     runs = (run for run in element.children if run.name in ("t", "r"))
-    return element.text if element.name == "t" else "".join(map(_rich_text, runs))
+    return unescaped(element.text) if element.name == "t" else "".join(map(_rich_text, runs))
+
+
+def unescaped(text: str) -> str:
+    """Return a stored text with its characters for ``_xHHHH_`` (ECMA-376 part 1, 22.9.2.19), as a pasted line break has."""
+    return _ESCAPE.sub(lambda match: chr(int(match[1], 16)), text)
 
 
 def shared_strings(elements: list[Element]) -> list[str]:
@@ -407,5 +413,5 @@ def _type_and_text(value: Any) -> tuple[str | None, str]:
     if isinstance(value, bool):
         return "b", str(int(value))
     if isinstance(value, str):
-        return "e" if isinstance(value, CellError) else "str", value
+        return "e" if isinstance(value, CellError) else "str", _ESCAPE.sub(r"_x005F\g<0>", value)
     return None, repr(value).removesuffix(".0")

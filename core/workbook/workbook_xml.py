@@ -82,10 +82,17 @@ class WorkbookXml:
         content_type = self.package.content_type(self._part)
         return next((suffix for suffix, kind in CONTENT_TYPE_OF_SUFFIX.items() if kind == content_type), None)
 
-    @property
+    @cached_property
     def asks_for_calculation(self) -> bool:
-        """Whether the file says that the formulas' stored values are not to be relied on."""
+        """Whether the file says that the formulas' stored values are not to be relied on.
+
+        Raises `InputError` for a workbook that calculates with the displayed digits.
+        """
         settings = [e.attributes for e in self._elements if e.name == "calcPr"]
+        if any(a.get("fullPrecision") in ("0", "false") for a in settings):
+            raise InputError(
+                'it calculates with the displayed digits: switch off "Set precision as displayed", and save'
+            )
         is_asked = any(a.get(name) in ("1", "true") for a in settings for name in ("fullCalcOnLoad", "forceFullCalc"))
         return is_asked or any(a.get("calcCompleted") in ("0", "false") for a in settings)
 

@@ -33,7 +33,13 @@ WORKBOOK = Path(__file__).parents[2] / "examples" / "dc-spect-80.xlsx"
 
 @pytest.fixture(scope="session")
 def registered() -> Iterator[None]:
-    """Register the extension in a Blender of factory settings, once: it takes longer than a scene."""
+    """Register the extension in a Blender of factory settings, once: it takes longer than a scene.
+
+    The tests in tests/field have this fixture, too, in the same process.
+    """
+    if hasattr(bpy.types.Scene, "mphdrr_display"):
+        yield
+        return
     bpy.ops.wm.read_factory_settings()
     registration.register()
     yield

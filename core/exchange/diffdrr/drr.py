@@ -115,7 +115,8 @@ class DRR(torch.nn.Module):
         matrix[:3, 3] += matrix[:3, :3] @ np.full(3, 0.5 - voxel_shift)
         self.subject = subject
         self.grid = Grid(whole_shape(prepared.density.shape, "volume", 3), matrix)
-        self.register_buffer("density", prepared.density.detach().clone())
+        density = prepared.density.detach().clone()
+        self.register_buffer("density", density if density.is_floating_point() else density.to(torch.float32))
         self.register_buffer("mask", prepared.mask)
         self.register_buffer("_hu", prepared.hu)
         self.register_buffer("_reorient", prepared.reorient.to(torch.float64))
@@ -188,6 +189,9 @@ class DRR(torch.nn.Module):
         if mask_to_channels:
             channels = [density * (self.mask == label) for label in range(int(self.mask.max()) + 1)]
         fans = _extend_fans(self.grid, vectors) if self.whole_line else [vectors]
+        if not len(vectors):
+            n_rays = self.detector.height * self.detector.width if self.subsample is None else len(self.subsample)
+            return self.density.new_zeros(0, len(channels), n_rays)
         images = [reduce(torch.add, [self._trace(channel, fan) for fan in fans]) for channel in channels]
         # Operations of torch on large tensors start threads, which then wait busily and slow down the projector's threads.
         return (torch.stack(images, dim=1) if images[1:] else images[0][:, None]).to(self.density)

@@ -213,7 +213,7 @@ NO_WORKBOOKS: dict[str, tuple[bytes, str]] = {
         b'<?xml version="1.0"?><Workbook xmlns="urn:schemas-microsoft-com:office:spreadsheet"/>',
         NONE,
     ),
-    "an old .xls": (OLE + bytes(600), "an old Excel .xls file"),
+    "an old .xls": (OLE + bytes(600) + "Workbook".encode("utf-16-le"), "an old Excel .xls file"),
     "a protected workbook": (OLE + bytes(600) + "EncryptedPackage".encode("utf-16-le"), "protected by a password"),
     "zeros": (bytes(5000), NONE),
     "a Git LFS pointer": (b"version https://git-lfs.github.com/spec/v1\noid sha256:00\nsize 25732\n", NONE),

@@ -1,6 +1,9 @@
 """Triangle meshes, their files, and the check that a mesh is closed."""
 
+import io
+import json
 import os
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,6 +20,8 @@ MESH_FORMATS = (".stl", ".obj", ".ply", ".glb")
 MILLIMETRES = {"um": 0.001, "mm": 1.0, "cm": 10.0, "m": 1000.0, "in": 25.4}
 """Millimetres per unit of length of a mesh file, by unit."""
 
+_LOOKS = ("KHR_materials", "KHR_texture", "KHR_lights", "KHR_xmp")  # extensions of glTF that change no shape
+_FLOAT = 5126  # component type of glTF
 # Corners closer to each other than this fraction of the mesh's size are one corner: files have six digits or more.
 _SAME_POINT = 1e-7
 
@@ -61,8 +66,56 @@ def read_mesh(path: AnyPath, unit: str | None = None) -> Mesh:
     path = Path(path)
     suffix, factor = _suffix_and_factor(path, unit)
     with reading(path, suffix):
-        mesh = trimesh.load(require_file(path), process=False, force="mesh")
+        content = require_file(path).read_bytes()
+        if suffix == ".obj":  # trimesh takes a comment behind a face for corners, and no lines that end with CR alone
+            content = re.sub(rb"#[^\r\n]*", b"", content).replace(b"\r", b"\n")
+            if re.search(
+                rb"^f[^\n]*[ \t]-.*\nv[ \t]", content, re.MULTILINE | re.DOTALL
+            ):  # it counts from the file's end
+                raise InputError(
+                    "faces with relative indices stand before further vertices: export it with absolute ones"
+                )
+        elif suffix == ".glb":
+            _require_plain_gltf(content)
+        elif suffix == ".stl":
+            _require_whole_stl(content)
+        mesh = trimesh.load(io.BytesIO(content), file_type=suffix[1:], process=False, force="mesh")
         return Mesh(np.asarray(mesh.vertices) * factor, np.asarray(mesh.faces))
+
+
+def _require_plain_gltf(content: bytes) -> None:
+    """Raise `InputError` for contents of a .glb of which trimesh reads another shape than glTF 2.0 says."""
+    header = json.loads(content[20 : 20 + int.from_bytes(content[12:16], "little")])
+    unknown = [name for name in header.get("extensionsRequired", ()) if not name.startswith(_LOOKS)]
+    meshes, accessors = header.get("meshes", ()), header.get("accessors", ())
+    primitives = [primitive for mesh in meshes for primitive in mesh.get("primitives", ())]
+    used = [
+        accessors[i] for p in primitives for i in (p["attributes"].get("POSITION"), p.get("indices")) if i is not None
+    ]
+    weights = [
+        *(mesh.get("weights", ()) for mesh in meshes),
+        *(node.get("weights", ()) for node in header.get("nodes", ())),
+    ]
+    for problem, is_there in (
+        (f"it requires {', '.join(unknown)}", unknown),
+        ("its positions are quantized", any(a["type"] == "VEC3" and a["componentType"] != _FLOAT for a in used)),
+        ("it has sparse accessors", any("sparse" in accessor for accessor in used)),
+        ("it has morph targets with weights", any(map(any, weights))),
+        ("its skin moves it", any("skin" in node for node in header.get("nodes", ()))),
+    ):
+        if is_there:
+            raise InputError(f"{problem}, which is not read: export the mesh without it, or as .ply")
+
+
+def _require_whole_stl(content: bytes) -> None:
+    """Raise `InputError` for an .stl file that is cut short, or goes on behind its triangles."""
+    size = 84 + 50 * int.from_bytes(content[80:84], "little")
+    if content.lstrip()[:5].lower() == b"solid" and b"facet" in content[:1024].lower():
+        if not re.search(rb"endsolid[^\r\n]*\s*$", content[-1024:].lower()):
+            raise InputError("it ends before endsolid: it is cut short")
+    elif len(content) != size:
+        expected = f"expected {size} bytes of {(size - 84) // 50} triangles, found {len(content)}"
+        raise InputError(f"{expected}: it is cut short, or has something behind them")
 
 
 def write_mesh(mesh: Mesh, path: AnyPath, unit: str | None = None) -> None:

@@ -15,12 +15,21 @@ def world_matrix(item: bpy.types.Object) -> NDArray[np.float64]:
     `Object.matrix_world` is out of date after a script has set a location, and while the object is hidden: it is used
     only for objects with constraints or a parent that is not a plain object.
     """
-    if any(not c.mute for c in item.constraints) or (item.parent is not None and item.parent_type != "OBJECT"):
+    if any(not c.mute for c in item.constraints):
         return np.array(item.matrix_world, dtype=np.float64)
-    local = np.array(item.matrix_basis, dtype=np.float64)
-    if item.parent is None:
-        return local
-    return world_matrix(item.parent) @ np.array(item.matrix_parent_inverse, dtype=np.float64) @ local
+    return _parent_matrix(item) @ np.array(item.matrix_basis, dtype=np.float64)
+
+
+def _parent_matrix(item: bpy.types.Object) -> NDArray[np.float64]:
+    """Return the matrix (4, 4), in float64, that leads from an object's own transform to the world."""
+    parent = item.parent
+    if parent is None:
+        return np.eye(4)
+    if item.parent_type != "OBJECT" or (parent.type == "CURVE" and parent.data.use_path):  # as Blender has evaluated it
+        return np.array(item.matrix_world, dtype=np.float64) @ np.linalg.inv(
+            np.array(item.matrix_basis, dtype=np.float64)
+        )
+    return world_matrix(parent) @ np.array(item.matrix_parent_inverse, dtype=np.float64)
 
 
 def world_matrices(items: Sequence[bpy.types.Object]) -> NDArray[np.float64]:
@@ -31,8 +40,7 @@ def world_matrices(items: Sequence[bpy.types.Object]) -> NDArray[np.float64]:
 def set_world_matrix(item: bpy.types.Object, matrix: NDArray[np.float64]) -> None:
     """Move an object to a world matrix (4, 4), under whatever parent it has."""
     if item.parent is not None:
-        parent = world_matrix(item.parent) @ np.array(item.matrix_parent_inverse, dtype=np.float64)
-        matrix = np.linalg.inv(parent) @ matrix
+        matrix = np.linalg.inv(_parent_matrix(item)) @ matrix
     item.matrix_basis = Matrix(matrix)
     if item.parent is None and item.rotation_mode == "XYZ":
         item.rotation_euler = euler_angles(matrix)

@@ -93,7 +93,7 @@ def evaluated_meshes(
             meshes[item] += _closed_meshes(item.evaluated_get(depsgraph), objects.world_matrix(item), item.name)
     for instance in depsgraph.object_instances:
         owner = instance.parent.original if instance.is_instance and instance.parent else None
-        if owner in meshes and instance.object.type == "MESH":
+        if owner is not None and owner in meshes and instance.object.type == "MESH":
             meshes[owner] += _closed_meshes(instance.object, np.array(instance.matrix_world, np.float64), owner.name)
     for item, item_meshes in meshes.items():
         if not item_meshes:

@@ -17,9 +17,9 @@ To add a setting, add a row to `_DECLARED` in settings.py; options, panels, reci
   these are (`core.reconstruction`).
 
 `Imaging` is the one route from a volume to images, with the same warnings, of runs, reconstructions and event sets. A
-preset is a row of `_ROWS` in presets.py. A file format of measured counts is a reader in frame_files.py that returns
-`Counts` with what the file says of its frames, and its endings in `_READERS` there; warnings about frames are
-`warn_of_frames` of frame_checks.py. Pictures are laid out by mosaic.py and coloured by display.py.
+preset is a row of `_ROWS` in presets.py. A file format of measured counts is a reader, such as interfile.py, that returns
+`FileFrames` with what the file says of its frames, and its endings in `_READERS` of frame_files.py; warnings about frames
+are `warn_of_frames` of frame_checks.py. Pictures are laid out by mosaic.py and coloured by display.py.
 """
 
 FORMATS = (".h5", ".hdf5", ".npz", ".pt")

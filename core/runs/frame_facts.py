@@ -54,6 +54,6 @@ def rescaled(frames: Array, slope: ArrayLike, intercept: float) -> Array:
     if (slopes == 1).all() and intercept == 0:
         return frames
     values = frames * np.broadcast_to(slopes, len(frames))[:, None, None] + intercept
-    whole, step = np.rint(values), float(np.abs(slopes).max())
+    whole_counts, step = np.rint(values), float(np.abs(slopes).max())
     rounding = 1e-9 * np.abs(values) + (2 * step if step <= _FINE else 0.0)
-    return np.asarray(whole if (np.abs(values - whole) <= rounding).all() else values)
+    return np.asarray(whole_counts if (np.abs(values - whole_counts) <= rounding).all() else values)

@@ -8,6 +8,7 @@ import math
 import operator
 import re
 from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -346,7 +347,7 @@ def _warn_of_contradictions(counts: Counts, used: list[int], words: list[str], r
     for k, along_u, along_v in zip(used, *steps, strict=True):
         size, pitch = counts.about[k, 1:3], (along_u, along_v)
         pitch = pitch[::-1] if words[k].endswith("u") else pitch  # along the rows of the frame, and down its columns
-        if any(differs(stated, own, is_rounded=True) for stated, own in zip(size, pitch, strict=True)):
+        if any(map(partial(differs, is_rounded=True), size, pitch)):
             stated, assumed = (" x ".join(f"{x:.4g}" for x in sizes) for sizes in (size, pitch))
             covering = "so that they cover the crystal; if the file is right, give their size (--pitch)"
             reason = covering if run.settings["pitch_mm"] is None else "as given"

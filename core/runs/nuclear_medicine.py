@@ -36,7 +36,7 @@ def read(path: Path) -> FileFrames:
     windows = _numbers_of_frames(dataset, "Energy Window", vector_sizes["Energy Window"])
     low, high = ([_window_limit(dataset, number, word) for number in windows] for word in ("Lower", "Upper"))
     times, starts = _durations(dataset, shape[0]), _starts(dataset, shape[0])
-    facts = {"time": times, "pixel": pixel, "window": windows, "start": starts, "low": low, "high": high}
+    facts: Any = {"time": times, "pixel": pixel, "window": windows, "start": starts, "low": low, "high": high}
     return FileFrames(frames, content, facts)
 
 

@@ -83,7 +83,7 @@ def aligned_starts(starts: list[Floats], names: list[str]) -> tuple[Floats, str]
 
     Raises `InputError` where some files state a date and others none, or where only dates could tell the order.
     """
-    firsts = [np.min(of_file, initial=math.inf, where=np.isfinite(of_file)) for of_file in starts]
+    firsts = [float(np.min(of_file, initial=math.inf, where=np.isfinite(of_file))) for of_file in starts]
     stated = [k for k, first in enumerate(firsts) if math.isfinite(first)]
     dated = [k for k in stated if firsts[k] > _FIRST_DATED]
     if dated and len(dated) < len(stated):

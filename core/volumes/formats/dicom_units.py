@@ -56,10 +56,12 @@ def real_world_values(header: Any) -> RealWorldValues | None:
         if not (math.isfinite(slope) and slope != 0 and math.isfinite(intercept)):
             raise InputError(f"RealWorldValueSlope: expected a number other than 0, got {slope:g}")
         maps.append(RealWorldValues(slope, intercept, codes[0] if codes else ""))
-    known_maps = [each for each in maps if unit_of(each.code)] or maps
-    quantities = {unit.quantity for each in known_maps if (unit := unit_of(each.code))}
+    known_maps = [mapping for mapping in maps if unit_of(mapping.code)] or maps
+    quantities = {unit.quantity for mapping in known_maps if (unit := unit_of(mapping.code))}
     if len(set(known_maps)) > 1:
-        listed = "; ".join(f"{each.slope:g} x value + {each.intercept:g} {each.code}" for each in known_maps)
+        listed = "; ".join(
+            f"{mapping.slope:g} x value + {mapping.intercept:g} {mapping.code}" for mapping in known_maps
+        )
         if len(quantities) > 1 or not agree(known_maps):
             raise InputError(f"RealWorldValueMapping: {listed}; expected one of them")
     return known_maps[0] if known_maps else None
@@ -67,8 +69,10 @@ def real_world_values(header: Any) -> RealWorldValues | None:
 
 def agree(maps: list[RealWorldValues]) -> bool:
     """Return whether maps to units of one quantity give the same values."""
-    factors = [unit.factor if (unit := unit_of(each.code)) else 1.0 for each in maps]
-    values = [(each.slope * factor, each.intercept * factor) for each, factor in zip(maps, factors, strict=True)]
+    factors = [unit.factor if (unit := unit_of(mapping.code)) else 1.0 for mapping in maps]
+    values = [
+        (mapping.slope * factor, mapping.intercept * factor) for mapping, factor in zip(maps, factors, strict=True)
+    ]
     return all(
         math.isclose(a, b, rel_tol=1e-6, abs_tol=1e-12) for row in values for a, b in zip(row, values[0], strict=True)
     )

@@ -128,8 +128,9 @@ def _scale(header: _Header, n_frames: int) -> tuple[Floats, float]:
             texts = ["1" if text.lower() in _UNITS_OF_COUNTS else text for text in header.all(name)]
             neutral = 1.0 if _FACTOR.fullmatch(name) else 0.0
             numbers = [stated_number(text, name, "a factor of the counts") for text in texts]
-            if any(number not in (neutral, math.nan) and not math.isnan(number) for number in numbers):
-                scales[name] = [neutral if math.isnan(number) else number for number in numbers]
+            numbers = [neutral if math.isnan(number) else number for number in numbers]
+            if any(number != neutral for number in numbers):
+                scales[name] = numbers
     factors = [(name, numbers) for name, numbers in scales.items() if _FACTOR.fullmatch(name)]
     if any(numbers != factors[0][1] for _, numbers in factors):
         pair = " and ".join(f"{name} = {', '.join(map(str, numbers))}" for name, numbers in factors[:2])

@@ -487,7 +487,7 @@ BAD = {
     "slices at one place": (_tomogram(SpacingBetweenSlices=0), "lie at the same place"),
     "an empty folder": (
         bad_file("empty")(lambda path, ct: path.mkdir())(),
-        "expected a folder with the images of a DICOM series",
+        "expected a folder with images of a DICOM series",
     ),
     "a pipe": (_pipe(), "neither a file nor a folder"),
     "an empty file": (_bytes("v.nrrd", b""), "it is empty"),

@@ -233,3 +233,13 @@ def test_numbers_without_air_are_doubted_as_ct_numbers(ct, shift, scale):
 def test_numbers_in_high_bits_are_refused(ct, tmp_path, bits, high):
     folder = series(ct, tmp_path / "a", lambda data, k: dicom_files.set_tags(data, BitsStored=bits, HighBit=high))
     refused(lambda: mph.read_volume(folder), f"HighBit {high}: expected {bits - 1}")
+
+
+@pytest.mark.parametrize("code", ["mg/cm3", "{effective atomic number}", "g/ml{SUVbw}"])
+@pytest.mark.parametrize("kind", ["HU", "US", None])
+def test_a_map_to_another_quantity_leaves_ct_numbers_ct_numbers(ct, tmp_path, kind, code):
+    tags = {"RescaleType": kind, "RealWorldValueMappingSequence": [dicom_files.real_world_values(7.0, 1.0, code)]}
+    same(mph.read_volume(series(ct, tmp_path / "a", lambda data, k: dicom_files.set_tags(data, **tags))), ct)
+    tags["RealWorldValueMappingSequence"] = [dicom_files.real_world_values(7.0, 1.0, "[hnsf'U]")]
+    folder = series(ct, tmp_path / "b", lambda data, k: dicom_files.set_tags(data, **tags))
+    refused(lambda: mph.read_volume(folder), "its rescaling is .* HU, RealWorldValueMapping 7 x value")

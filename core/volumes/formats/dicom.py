@@ -121,11 +121,8 @@ def read(path: Path, series: str | None = None, progress: Progress | None = None
 def _quantity(modality: str, code: str) -> DicomUnit:
     """Return the quantity and factor of values in the unit `code`; the quantity of others is a text: "PT in GML"."""
     unit = unit_of(code)
-    if modality == "CT" and code in _HOUNSFIELD:
-        return DicomUnit("hu", 1.0)
-    if unit is None or unit.quantity == "counts":
-        return DicomUnit(f"{modality} in {code}" if code else modality, 1.0)
-    return unit
+    is_known = unit is not None and unit.quantity != "counts"
+    return unit if unit and is_known else DicomUnit(f"{modality} in {code}" if code else modality, 1.0)
 
 
 def _read_headers(path: Path) -> list[tuple[Path, Any]]:
@@ -163,9 +160,7 @@ def _read_headers(path: Path) -> list[tuple[Path, Any]]:
         top = path if path.is_dir() else path.parent
         files = [file for file in islice(top.rglob("*"), _MOST_FILES) if file.is_file() and is_dicom(file)]
         folders = ", ".join(sorted({str(file.parent.relative_to(top)) for file in files} - {"."})) or "none"
-        raise InputError(
-            f"expected a folder with the images of a DICOM series; folders with DICOM files in it: {folders}"
-        )
+        raise InputError(f"expected a folder with images of a DICOM series; folders with DICOM files in it: {folders}")
     # pydicom reads a truncated file as one with fewer tags. If it has the SOP class of the images, it is one of them.
     image_classes = set(map(_sop_class, headers.values()))
     for file, header in without_pixels.items():
@@ -261,16 +256,16 @@ def _rescaling(header: Any, frame: Any) -> RealWorldValues:
 
     `InputError` where both are to one quantity and give other values.
     """
-    slope, intercept = (
-        float(_numbers(frame, name, 1, x)[0]) for name, x in (("RescaleSlope", 1.0), ("RescaleIntercept", 0.0))
-    )
-    rescaling = RealWorldValues(slope, intercept, str(header.get("Units") or frame.get("RescaleType") or ""))
+    slope, intercept = (float(_numbers(frame, f"Rescale{x}", 1, y)[0]) for x, y in (("Slope", 1.0), ("Intercept", 0.0)))
+    code = str(header.get("Units") or frame.get("RescaleType") or "")
+    code = "HU" if header.get("Modality") == "CT" and code in _HOUNSFIELD else code
+    rescaling = RealWorldValues(slope, intercept, code)
     mapped = real_world_values(frame) or real_world_values(header)
     stated_unit, unit = unit_of(rescaling.code), unit_of(mapped.code) if mapped else None
     if mapped is None or (unit is None and stated_unit is not None):
         return rescaling
     if unit and stated_unit and unit.quantity == stated_unit.quantity and not agree([rescaling, mapped]):
-        pair = f"{slope:g} x value + {intercept:g} {rescaling.code}, RealWorldValueMapping {mapped.slope:g} x value"
+        pair = f"{slope:g} x value + {intercept:g} {code}, RealWorldValueMapping {mapped.slope:g} x value"
         raise InputError(f"its rescaling is {pair} + {mapped.intercept:g} {mapped.code}: expected one of them")
     return mapped
 

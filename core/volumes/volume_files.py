@@ -65,7 +65,8 @@ def read_volume(
             contents = replace(contents, affine=real_array(affine, "affine", (4, 4)))
         if contents.quantity is not None and contents.quantity not in UNITS and quantity is None:
             raise InputError(f"it holds {contents.quantity!r}: say which quantity that is, one of {', '.join(UNITS)}")
-        _require_quantity(contents, quantity)
+        if contents.is_certain:
+            _require_quantity(contents, quantity)
         return contents.to_volume(quantity or contents.quantity or "hu")
 
 

@@ -63,7 +63,7 @@ def test_convert_does_all_steps_in_order(tmp_path, ct, capsys):
         (("--energy", "80"), "--energy needs --to-mu"),
         (("--method", "nearest"), "--method needs --spacing"),
         (("--to-mu", "--energy", "Xx-1"), "energy 'Xx-1': expected keV, or one of F-18"),
-        (("--to-mu", "--quantity", "mu"), "it holds hu, expected mu in 1/mm"),
+        (("--to-mu", "--quantity", "mu"), "expected a volume of hu, got mu"),
         (("--spacing", "1", "2"), "--spacing: expected one or three numbers"),
         (("--crop", "0", "1", "0", "1", "0", "1"), "the volume is not in it"),
         (("--affine", *["0"] * 16), "affine"),

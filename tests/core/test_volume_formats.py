@@ -109,7 +109,7 @@ def write_meta_image(path: Path, array: np.ndarray, data: bytes | None = None, *
         **changes,
     }
     header["ElementDataFile"] = header.pop("ElementDataFile")  # the last line
-    text = "".join(f"{key} = {value}\n" for key, value in header.items())
+    text = "".join(f"{key} = {value}\n" for key, value in header.items() if value)
     path.write_bytes(text.encode() + (array.tobytes(order="F") if data is None else data))
 
 

@@ -35,6 +35,8 @@ class VolumeFileContents:
     """Quantity of the values as stated in the file, or None."""
     unit: str | None = None
     """Unit of the values as stated in the file, or None."""
+    is_certain: bool = False
+    """Whether the quantity follows from the format's own unit, so that the user cannot mean another one."""
 
     def to_volume(self, quantity: str) -> Volume:
         """Return the voxels as a `Volume` of `quantity`; raise `InputError` if the file's unit does not fit its quantity."""

@@ -115,7 +115,7 @@ def read(path: Path, series: str | None = None, progress: Progress | None = None
             array[:, :, k] = (pixels.astype(np.float64) * image.slope + image.intercept).T * factor
             tell(progress, k + 1, len(slices))
     axes = np.column_stack([*(first.orientation * np.array(first.spacing[::-1])[:, None]), step])
-    return VolumeFileContents(array, RAS_FROM_LPS @ affine_matrix(axes, first.position), quantity)
+    return VolumeFileContents(array, RAS_FROM_LPS @ affine_matrix(axes, first.position), quantity, None, True)
 
 
 def _quantity(modality: str, code: str) -> DicomUnit:

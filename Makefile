@@ -1,5 +1,5 @@
 # make demo    the whole main path on the real workbook, into out/
-# make test    linters, types and tests (tests/core, tests/blender); TESTS=--once: laws of numbers in one case each
+# make test    linters, types and tests (tests/core, tests/blender, tests/field); TESTS=--once: laws of numbers in one case each
 # make test-long   the tests that take minutes: long property runs, workbooks through LibreOffice
 # make bench   speed, accuracy and memory beside other projectors, into docs/; BENCH=--quick: a minute or two, into out/
 # make bench-events   event sets beside the usual pipeline with DiffDRR, into docs/; BENCH=--quick: a minute, into out/

@@ -67,8 +67,8 @@ def update_hidden_scenes() -> None:
     Blender does so only when it shows them, but looks through their objects once a minute (`DRW_cache_free_old_batches`),
     and would crash on removed ones.
     """
-    shown = {window.scene for window in bpy.context.window_manager.windows}
-    for layer in [layer for scene in bpy.data.scenes if scene not in shown for layer in scene.view_layers]:
+    visible_scenes = {window.scene for window in bpy.context.window_manager.windows}
+    for layer in [layer for scene in bpy.data.scenes if scene not in visible_scenes for layer in scene.view_layers]:
         if layer.depsgraph is not None:
             layer.update()
 

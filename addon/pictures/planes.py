@@ -74,7 +74,8 @@ def _remove(unwanted: list[bpy.types.Object]) -> None:
     for plane in unwanted:
         if plane.parent is not None:
             _remove_background(plane.parent.data, plane.data)
-    objects.remove_objects(unwanted)
+    bpy.data.batch_remove(unwanted)  # their pictures stay, which may be the user's
+    objects.update_hidden_scenes()
 
 
 def update(scene: bpy.types.Scene) -> None:

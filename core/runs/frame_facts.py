@@ -46,7 +46,8 @@ def file_numbers(path: Path, kind: np.dtype[Any], shape: tuple[int, ...], skip: 
 def rescaled(frames: Array, slope: ArrayLike, intercept: float) -> Array:
     """Return slope x frames + intercept; `slope` is one number or one of each frame.
 
-    Whole counts that were stored in fine steps, as programs scale the largest to 65535, become whole again, if all are.
+    Whole counts that were stored in fine steps become whole again, if all numbers are what would be stored for some: nearest
+    to a whole number, or the largest, at which programs cut off, within two steps of one.
     """
     slopes = np.asarray(slope, np.float64)
     if not (slopes != 0).all():
@@ -55,5 +56,6 @@ def rescaled(frames: Array, slope: ArrayLike, intercept: float) -> Array:
         return frames
     values = frames * np.broadcast_to(slopes, len(frames))[:, None, None] + intercept
     whole_counts, step = np.rint(values), float(np.abs(slopes).max())
-    rounding = 1e-9 * np.abs(values) + (2 * step if step <= _FINE else 0.0)
+    steps = np.where((frames == frames.max()) & (values > 0.5), 2.0, 0.5) * (step if step <= _FINE else 0.0)
+    rounding = 1e-9 * (step + np.abs(values)) + steps
     return np.asarray(whole_counts if (np.abs(values - whole_counts) <= rounding).all() else values)

@@ -209,6 +209,14 @@ def test_planes_stand_where_they_are_told(projected, scene, ring_system):
     assert plane.color[3] == background.alpha == 0.25 and not background.show_background_image
 
 
+def test_a_picture_of_the_users_on_a_plane_stays(projected, scene):
+    projected()
+    picture = bpy.data.images.new("Mine", 4, 4)
+    planes.planes(scene)[0].data = picture
+    planes.remove(scene)
+    assert not planes.planes(scene) and bpy.data.images.get("Mine") == picture
+
+
 def test_another_run_replaces_planes_and_backgrounds(projected, scene):
     projected()
     made = projected(last=3)

@@ -24,6 +24,13 @@ def test_a_factor_of_interfile_is_applied(frames, tmp_path, key, factor):
     np.testing.assert_allclose(mph.read_counts(path), 6 * frames, rtol=1e-9)
 
 
+@pytest.mark.parametrize("stored", [[0, 1, 2], [0, 3, 40], [0, 1, 100], [1, 50, 101]])
+def test_expected_counts_in_fine_steps_are_not_rounded(frames, tmp_path, stored):
+    numbers = np.resize(stored, frames.shape)
+    path = write_interfile(tmp_path / "a.hdr", numbers, "image scaling factor [1] := 0.01")
+    np.testing.assert_allclose(mph.read_counts(path), 0.01 * numbers)
+
+
 def test_factors_that_differ_are_refused_and_words_are_none(frames, tmp_path):
     path = tmp_path / "a.hdr"
     both = "quantification units := 0.5", "image scaling factor [1] := 0.25"

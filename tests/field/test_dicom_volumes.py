@@ -74,6 +74,15 @@ def test_counts_and_unknown_units_are_scaled_and_asked_for(ct, tmp_path):
     refused(lambda: mph.read_volume(path), "1 x value + 0 Bq/ml; 2 x value + 0 Bq/ml; expected one of them")
 
 
+@pytest.mark.parametrize("first, last", [(0, 100), (1700, 65535), (500, 1000)])
+def test_a_map_of_a_part_of_the_values_is_refused(ct, tmp_path, first, last):
+    mapped = dicom_files.real_world_values(0.5, 0.0, "Bq/ml")
+    dicom_files.set_tags(mapped, RealWorldValueFirstValueMapped=first, RealWorldValueLastValueMapped=last)
+    volume = mph.Volume(2 * (ct.array + 1000) + 1, ct.grid)
+    dicom_files.write_tomogram(volume, tmp_path / "t.dcm", RealWorldValueMappingSequence=[mapped])
+    refused(lambda: mph.read_volume(tmp_path / "t.dcm"), f"of stored values {first} to {last}, found")
+
+
 def series(ct: mph.Volume, folder: Path, edit=lambda data, k: None, **options) -> Path:
     """Write a CT as a series of slices, each changed by `edit`; return the folder."""
     for k, data in enumerate(dicom_files.write_series(ct, folder, **options)):

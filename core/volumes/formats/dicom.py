@@ -235,7 +235,7 @@ def _read_slices(path: Path, header: Any) -> Iterator[_Slice]:
         spacing = _numbers(frame, "PixelSpacing", 2)
         if spacing.min() <= 0:
             raise InputError(f"PixelSpacing: expected more than 0 mm, got {spacing.min():g}")
-        slope, intercept, unit = _rescaling(header, frame)
+        slope, intercept, unit, *_ = _rescaling(header, frame)
         yield _Slice(
             path=path,
             frame=number,
@@ -375,9 +375,12 @@ def _read_pixels(slices: list[_Slice]) -> Iterator[tuple[_Slice, Array]]:
 
 
 def decode_pixels(data: Any) -> Array:
-    """Return the stored values of a pydicom data set that was read with its pixels."""
+    """Return the stored values of a pydicom data set that was read with its pixels.
+
+    `InputError` where its real world value map is of some of the values only.
+    """
     try:
-        return np.asarray(data.pixel_array)
+        stored = np.asarray(data.pixel_array)
     except Exception as error:  # truncated, or compressed by a method that is not installed
         syntax = data.file_meta.TransferSyntaxUID
         fault = f"cannot be read ({first_line(error)})"
@@ -385,6 +388,11 @@ def decode_pixels(data: Any) -> Array:
             advice = "install pylibjpeg with its plugins, or save the series without compression"
             fault = f"are compressed ({syntax.name}), which cannot be decoded here; {advice}"
         raise InputError(f"its pixels {fault}") from error
+    mapped = real_world_values(data)
+    if mapped and unit_of(mapped.code) and not (mapped.first <= stored.min() and stored.max() <= mapped.last):
+        limits = f"{mapped.first:g} to {mapped.last:g}, found {stored.min()} to {stored.max()}"
+        raise InputError(f"RealWorldValueMapping is of stored values {limits}: expected one of all")
+    return stored
 
 
 def _tomogram_tags(header: Any) -> list[dict[str, Any]]:

@@ -39,13 +39,16 @@ class RealWorldValues(NamedTuple):
     intercept: float
     code: str
     """Code of the unit as in the file."""
+    first: float = -math.inf
+    """Smallest stored value that is mapped."""
+    last: float = math.inf
+    """Largest stored value that is mapped."""
 
 
 def real_world_values(header: Any) -> RealWorldValues | None:
     """Return the rescaling of a header or frame by RealWorldValueMappingSequence; None where it has none.
 
-    Of several maps the one to a known unit is taken. `InputError` for a table of values, for maps that differ, and for a map
-    of a part of the stored values.
+    Of several maps the one to a known unit is taken. `InputError` for a table of values, and for maps that differ.
     """
     maps = []
     for item in header.get("RealWorldValueMappingSequence") or ():
@@ -55,7 +58,11 @@ def real_world_values(header: Any) -> RealWorldValues | None:
         slope, intercept = float(item.RealWorldValueSlope), float(item.get("RealWorldValueIntercept") or 0)
         if not (math.isfinite(slope) and slope != 0 and math.isfinite(intercept)):
             raise InputError(f"RealWorldValueSlope: expected a number other than 0, got {slope:g}")
-        maps.append(RealWorldValues(slope, intercept, codes[0] if codes else ""))
+        limits = (item.get(f"RealWorldValue{name}ValueMapped") for name in ("First", "Last"))
+        first, last = (
+            x if limit is None else float(limit) for limit, x in zip(limits, (-math.inf, math.inf), strict=True)
+        )
+        maps.append(RealWorldValues(slope, intercept, codes[0] if codes else "", first, last))
     known_maps = [mapping for mapping in maps if unit_of(mapping.code)] or maps
     quantities = {unit.quantity for mapping in known_maps if (unit := unit_of(mapping.code))}
     if len(set(known_maps)) > 1:

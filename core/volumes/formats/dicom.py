@@ -56,10 +56,8 @@ class _Slice:
     spacing: tuple[float, float]  # distances between rows and between columns, mm
     orientation: Floats  # unit vectors (2, 3) along a row and down the rows, LPS
     position: Floats  # centre (3,) of the first pixel, mm, LPS
-    slope: float  # value = slope * stored value + intercept
-    intercept: float  # in the unit of the values
+    values: RealWorldValues  # slope, intercept and unit of the values, from the stored ones
     thickness: float  # slice thickness, mm, or 0 if not stated
-    unit: str  # code for the values' unit, of DICOM or UCUM, or ""
     is_rescaled: bool  # whether the file states the rescaling
 
     @property
@@ -107,12 +105,12 @@ def read(path: Path, series: str | None = None, progress: Progress | None = None
                 slices += _read_slices(file, header)
         slices, step = _sort_slices(slices)
         first = slices[0]
-        quantity, factor = _quantity(str(headers[0][1].get("Modality")), first.unit)
+        quantity, factor = _quantity(str(headers[0][1].get("Modality")), first.values.code)
         rows, columns = first.shape
         require_voxels((columns, rows, len(slices)), np.dtype(np.float32))
         array = np.empty((columns, rows, len(slices)), np.float32)
         for k, (image, pixels) in enumerate(_read_pixels(slices)):
-            array[:, :, k] = (pixels.astype(np.float64) * image.slope + image.intercept).T * factor
+            array[:, :, k] = (pixels.astype(np.float64) * image.values.slope + image.values.intercept).T * factor
             tell(progress, k + 1, len(slices))
     axes = np.column_stack([*(first.orientation * np.array(first.spacing[::-1])[:, None]), step])
     return VolumeFileContents(array, RAS_FROM_LPS @ affine_matrix(axes, first.position), quantity, None, True)
@@ -235,38 +233,33 @@ def _read_slices(path: Path, header: Any) -> Iterator[_Slice]:
         spacing = _numbers(frame, "PixelSpacing", 2)
         if spacing.min() <= 0:
             raise InputError(f"PixelSpacing: expected more than 0 mm, got {spacing.min():g}")
-        slope, intercept, unit, *_ = _rescaling(header, frame)
         yield _Slice(
-            path=path,
-            frame=number,
-            shape=(int(header.Rows), int(header.Columns)),
-            spacing=(float(spacing[0]), float(spacing[1])),
-            orientation=_directions(frame),
-            position=_numbers(frame, "ImagePositionPatient", 3),
-            slope=slope,
-            intercept=intercept,
+            path, number, (int(header.Rows), int(header.Columns)), (float(spacing[0]), float(spacing[1])),
+            _directions(frame), _numbers(frame, "ImagePositionPatient", 3), _frame_values(header, frame),
             thickness=float(_numbers(frame, "SliceThickness", 1, 0.0)[0]),
-            unit=unit,
             is_rescaled=frame.get("RescaleSlope") is not None,
-        )
+        )  # fmt: skip
 
 
-def _rescaling(header: Any, frame: Any) -> RealWorldValues:
+def stated_rescaling(tags: Any, code: str) -> RealWorldValues:
+    """Return the rescaling to the unit `code` by Rescale Slope and Intercept, 1 and 0 where the `tags` have none."""
+    slope, intercept = (_numbers(tags, f"Rescale{x}", 1, y)[0] for x, y in (("Slope", 1.0), ("Intercept", 0.0)))
+    return RealWorldValues(float(slope), float(intercept), code)
+
+
+def _frame_values(header: Any, frame: Any) -> RealWorldValues:
     """Return slope, intercept and unit of a frame's values: those of its real world values, or else of its rescaling.
 
     `InputError` where both are to one quantity and give other values.
     """
-    slope, intercept = (float(_numbers(frame, f"Rescale{x}", 1, y)[0]) for x, y in (("Slope", 1.0), ("Intercept", 0.0)))
     code = str(header.get("Units") or frame.get("RescaleType") or "")
-    code = "HU" if header.get("Modality") == "CT" and code in _HOUNSFIELD else code
-    rescaling = RealWorldValues(slope, intercept, code)
-    mapped = real_world_values(frame) or real_world_values(header)
-    stated_unit, unit = unit_of(rescaling.code), unit_of(mapped.code) if mapped else None
-    if mapped is None or (unit is None and stated_unit is not None):
+    rescaling = stated_rescaling(frame, "HU" if header.get("Modality") == "CT" and code in _HOUNSFIELD else code)
+    mapped = real_world_values(frame) or real_world_values(header) or rescaling
+    stated_unit, unit = unit_of(rescaling.code), unit_of(mapped.code)
+    if unit is None and stated_unit is not None:
         return rescaling
     if unit and stated_unit and unit.quantity == stated_unit.quantity and not agree([rescaling, mapped]):
-        pair = f"{slope:g} x value + {intercept:g} {code}, RealWorldValueMapping {mapped.slope:g} x value"
-        raise InputError(f"its rescaling is {pair} + {mapped.intercept:g} {mapped.code}: expected one of them")
+        raise InputError(f"its rescaling is {rescaling}, RealWorldValueMapping {mapped}: expected one of them")
     return mapped
 
 
@@ -308,7 +301,7 @@ def _sort_slices(slices: list[_Slice]) -> tuple[list[_Slice], Floats]:
         for feature, is_same in (
             (f"{shape[1]} x {shape[0]} pixels", shape == first.shape),
             (f"pixels of {spacing[0]:g} x {spacing[1]:g} mm", np.allclose(spacing, first.spacing, 1e-4)),
-            (f"values in {image.unit or 'no stated unit'}", image.unit == first.unit),
+            (f"values in {image.values.code or 'no stated unit'}", image.values.code == first.values.code),
             ("a RescaleSlope" if image.is_rescaled else "no RescaleSlope", image.is_rescaled == first.is_rescaled),
             ("another orientation", np.allclose(image.orientation, first.orientation, atol=_SAME_ORIENTATION)),
         ):

@@ -21,14 +21,14 @@ _CLOCK = re.compile(
 )
 
 
-def stated_number(text: object, name: str, expected: str = "a number") -> float:
-    """Return the finite number that a file states; NaN for a text that says nothing, such as "" and "unknown".
+def stated_number(text: object, name: str, expected: str = "a number", default: float = math.nan) -> float:
+    """Return the finite number that a file states, or `default` for a text that says nothing, such as "" and "unknown".
 
     `InputError` for other texts names the field `name` and what was `expected`.
     """
     words = str("" if text is None else text).strip()
     if words.lower() in _UNSTATED:
-        return math.nan
+        return default
     refusal = f"{name} = {words}: expected {expected}"
     with expecting(refusal):
         number = float(words)
@@ -88,9 +88,8 @@ def aligned_starts(starts: list[Floats], names: list[str]) -> tuple[Floats, str]
     dated = [k for k in stated if firsts[k] > _FIRST_DATED]
     if dated and len(dated) < len(stated):
         undated = next(k for k in stated if k not in dated)
-        raise InputError(
-            f"{names[undated]}: its start has no date, that of {names[dated[0]]} has; expected a date in both"
-        )
+        pair = f"{names[undated]}: its start has no date, that of {names[dated[0]]} has"
+        raise InputError(f"{pair}; expected a date in both")
     days, text = dict.fromkeys(stated, 0.0), ""
     for previous, k in [] if dated else list(pairwise(stated)):
         gap = firsts[k] - firsts[previous]

@@ -16,7 +16,7 @@ from ..arrays import Floats
 from ..errors import InputError
 from ..files import require_file
 from .frame_facts import FileFrames, file_numbers, rescaled
-from .stated_times import moment, past_midnight, stated_duration, stated_number
+from .stated_times import DAY, moment, stated_duration, stated_number
 
 _LONGEST_HEADER = 1 << 20  # bytes
 _NUMBER_TYPES = ("u1", "u2", "u4", "u8", "i1", "i2", "i4", "i8", "f4", "f8")
@@ -194,7 +194,8 @@ def _starts(header: _Header, times: list[float], sizes: list[int]) -> list[float
     if relative:
         starts = _in_blocks(relative, sizes, n_frames, relative_key)
     elif len(clocks) > 1:
-        return _in_blocks(past_midnight(np.array(clocks)).tolist(), sizes, n_frames, "image start time")
+        starts = [clock + DAY * (clock < begin - DAY / 2) for clock in clocks]  # of the day after the first's
+        return _in_blocks(starts, sizes, n_frames, "image start time")
     elif sizes and header.whole("number of detector heads", 1) == 1:
         between_images = header.pauses("pause between images (sec)", len(sizes))
         between_groups = header.pauses("pause between frame groups (sec)", len(sizes))

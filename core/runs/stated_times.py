@@ -73,11 +73,6 @@ def moment(day: object, clock: object, name: str) -> float:
     return seconds + 3600.0 * hours + 60.0 * minutes + rest
 
 
-def past_midnight(starts: Floats) -> Floats:
-    """Return the moments, s, of a file's frames, with a day added to those more than half a day before the first."""
-    return starts + DAY * (starts < starts[0] - _HALF_DAY) if len(starts) else starts
-
-
 def aligned_starts(starts: list[Floats], names: list[str]) -> tuple[Floats, str]:
     """Return the moments, s, of the frames of several files one after the other, and a text to warn of ("" for none).
 

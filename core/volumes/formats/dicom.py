@@ -95,7 +95,7 @@ def read(path: Path, series: str | None = None, progress: Progress | None = None
     """
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", module="pydicom")  # warnings of tags that are not used here
-        headers = _choose_series(_read_headers(path), path, series)
+        headers = _choose_series(_read_headers(path), series)
         if len(headers) > 1 and any(_is_whole_volume(header) for _, header in headers):
             names = ", ".join(file.name for file, _ in headers)
             raise InputError(f"its series has several files of several frames each, choose one: {names}")
@@ -126,7 +126,6 @@ def _quantity(modality: str, code: str) -> DicomUnit:
 def _read_headers(path: Path) -> list[tuple[Path, Any]]:
     """Read path and header of all images in the folder, or of a file's series, without pixels."""
     import pydicom
-    from pydicom.errors import InvalidDicomError
 
     files = sorted(path.iterdir()) if path.is_dir() else [path, *sorted(path.parent.iterdir())]
     series_uid = None  # of the file at `path`; None for a folder
@@ -135,16 +134,14 @@ def _read_headers(path: Path) -> list[tuple[Path, Any]]:
     for file in files:
         if file in headers or file.is_dir() or file.name.startswith("._"):  # ._NAME: a folder's data of macOS
             continue
-        try:
-            if not (is_dicom(require_file(file)) or file.suffix.lower() in (".dcm", ".ima") or _is_bare(file)):
-                continue
-            header = pydicom.dcmread(file, stop_before_pixels=True, force=_is_bare(file))
-        except InvalidDicomError:
-            raise InputError(f"{file.name} is no DICOM file") from None
-        except InputError as error:
-            raise InputError(f"{file.name}: {error}") from None
-        except Exception as error:  # whatever pydicom raises on a damaged file
-            raise InputError(f"{file.name} cannot be read as DICOM ({first_line(error)})") from None
+        with naming(file.name):
+            is_bare = _is_bare(require_file(file))
+        if not (is_bare or is_dicom(file)):
+            if file.suffix.lower() in (".dcm", ".ima"):
+                raise InputError(f"{file.name} is no DICOM file")
+            continue
+        with reading(file.name, "DICOM"):
+            header = pydicom.dcmread(file, stop_before_pixels=True, force=is_bare)
         if file == path:
             if "Rows" in header and (_is_whole_volume(header) or "PerFrameFunctionalGroupsSequence" in header):
                 return [(file, header)]
@@ -197,7 +194,7 @@ def _sop_class(header: Any) -> str:
     return str(header.file_meta.get("MediaStorageSOPClassUID") or header.get("SOPClassUID", ""))
 
 
-def _choose_series(headers: list[tuple[Path, Any]], path: Path, series: str | None) -> list[tuple[Path, Any]]:
+def _choose_series(headers: list[tuple[Path, Any]], series: str | None) -> list[tuple[Path, Any]]:
     """Return the headers of the series with this number, description or UID, or of the only series."""
     all_series: dict[str, list[tuple[Path, Any]]] = defaultdict(list)
     for file, header in headers:

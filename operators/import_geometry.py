@@ -51,7 +51,7 @@ class MPHDRR_OT_import_geometry(bpy.types.Operator):
         options={"SKIP_SAVE"},
     )
     chosen_columns: StringProperty(
-        name="Chosen Columns", description="Column map of the dialog, TOML", options={"HIDDEN", "SKIP_SAVE"}
+        name="Columns", description="The dialog's map, TOML", options={"HIDDEN", "SKIP_SAVE"}
     )
     plate_thickness: FloatProperty(name="Plate (mm)",
                                    description="Thickness in mm of the aperture plate that holds the pinhole",

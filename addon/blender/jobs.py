@@ -194,9 +194,7 @@ class JobOperator:
 
     bl_options = {"REGISTER", "UNDO"}
 
-    confirmed: BoolProperty(
-        name="Confirmed", description="Start without asking", options={"HIDDEN", "SKIP_SAVE"}, default=False
-    )
+    confirmed: BoolProperty(name="Confirmed", description="Start without asking", options={"HIDDEN", "SKIP_SAVE"})
 
     asks_for = ""
     """The property that the user sets in a file browser, unless it is set already, as by dropping a file on the window."""

@@ -201,18 +201,14 @@ class ProjectionProperties(ProjectionSettings, bpy.types.PropertyGroup):
                             type=bpy.types.Object, poll=_is_ours, update=_volume_chosen)  # fmt: skip
     all_modules: BoolProperty(name="All Modules", description="Project into every module, not a range of numbers",
                               get=_projects_all, set=_project_all)  # fmt: skip
-    fitted: StringProperty(
-        name="Fitted Model", description="Model chosen for the volume's quantity", options={"HIDDEN"}
-    )
+    fitted: StringProperty(name="Fitted", description="Model chosen for the volume's quantity", options={"HIDDEN"})
     mu: PointerProperty(
         name="Attenuation", description="Volume of attenuation coefficients (1/mm) before the pinhole, or of CT numbers, "
         "which attenuate each line of the isotope at its energy; empty: none",
         type=bpy.types.Object, poll=_attenuates,
     )  # fmt: skip
     runs: CollectionProperty(type=RunProperties, name="Runs", options={"HIDDEN"})
-    active_run: IntProperty(
-        name="Run", description="Run in the list whose images are shown", update=on_edit("active_run")
-    )
+    active_run: IntProperty(name="Run", description="Run whose images are shown", update=on_edit("active_run"))
     run_file: path_property("Run", "File with the shown run's exact arrays", "HIDDEN")
     run_summary: StringProperty(name="Shown Run", description="Contents of the shown run", options={"HIDDEN"})
 

@@ -79,9 +79,8 @@ class MPHDRR_OT_import_geometry(bpy.types.Operator):
                 self.chosen_columns = column_maps.accept(form).to_toml()
             elif self.choose_columns and not self.chosen_columns:
                 if not self._has_window():  # a script cannot answer
-                    raise InputError(
-                        "choose_columns opens a dialog: in a script set columns to a column map (.toml) instead"
-                    )
+                    advice = "in a script set columns to a column map (.toml) instead"
+                    raise InputError(f"choose_columns opens a dialog: {advice}")
                 column_maps.fill(form, self._workbook(), self._columns())
                 return self._ask_columns(context)
             with reports.warnings_reported(self):

@@ -26,9 +26,7 @@ def _parent_matrix(item: bpy.types.Object) -> NDArray[np.float64]:
     if parent is None:
         return np.eye(4)
     if item.parent_type != "OBJECT" or (parent.type == "CURVE" and parent.data.use_path):  # as Blender has evaluated it
-        return np.array(item.matrix_world, dtype=np.float64) @ np.linalg.inv(
-            np.array(item.matrix_basis, dtype=np.float64)
-        )
+        return np.array(item.matrix_world, np.float64) @ np.linalg.inv(np.array(item.matrix_basis, np.float64))
     return world_matrix(parent) @ np.array(item.matrix_parent_inverse, dtype=np.float64)
 
 

@@ -98,8 +98,7 @@ def parse_seal(start: bytes) -> Seal | None:
 
     Raises `InputError` if the seal is damaged, or of a newer format.
     """
-    match = _TEXT.fullmatch(start)
-    if match is None:
+    if (match := _TEXT.fullmatch(start)) is None:
         if start.startswith(b"mphDRR "):
             raise InputError(f"changed: its first {HEADER} bytes are not as they were written")
         return None
@@ -132,8 +131,7 @@ def opened(path: AnyPath, offset: int = 0, *, whole: bool = False) -> Iterator[A
 
     path = require_file(path)
     with reading(path, "HDF5"), open(path, "rb") as file:
-        sealed = _sealed(file, offset)
-        if sealed is None:
+        if (sealed := _sealed(file, offset)) is None:
             if offset:
                 raise InputError(f"damaged: nothing of mphDRR begins at its byte {offset}")
             _probe(path)

@@ -80,8 +80,7 @@ class MPHDRR_OT_clean_volume_files(Reported, bpy.types.Operator):
     bl_options = {"REGISTER"}
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
-        unused = storage.unused_volumes()
-        if not unused:
+        if not (unused := storage.unused_volumes()):
             return self.execute(context)
         message = "Neither Undo nor other .blend files that use this folder will find them again."
         return ask_to_remove(self, context, event, f"Remove {storage.summarize_unused(unused)}?", message)

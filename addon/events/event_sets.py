@@ -185,8 +185,7 @@ def open_event_job(context: bpy.types.Context, folder: str, number: int, model: 
         if stored_event.phantom is not None:
             settings.phantom = _place_phantom(scene, stored_event.phantom, target)
             yield None
-        item = jobs.find_by_uid(bpy.data.objects, truth_uid)
-        if item is None:
+        if (item := jobs.find_by_uid(bpy.data.objects, truth_uid)) is None:
             item = volumes.add_stored(stored_event.truth, stored_event.name, scene.collection)
         else:
             volumes.replace_stored(item, stored_event.truth)
@@ -259,8 +258,7 @@ def _scaled(value: Any, factor: float) -> Any:
 
 def _place_phantom(scene: bpy.types.Scene, phantom: _Phantom, target: _Target) -> bpy.types.Object:
     """Give the scene's phantom an event's settings, voxels and pose, and return its object; add a new one if it is gone."""
-    item = jobs.find_by_uid(bpy.data.objects, target.uid)
-    if item is None:
+    if (item := jobs.find_by_uid(bpy.data.objects, target.uid)) is None:
         item = volumes.add_stored(phantom.stored[0], "Event Phantom", scene.collection)
     if phantom.settings is None:
         volumes.replace_stored(item, phantom.stored[0])

@@ -52,8 +52,7 @@ def map_job(
         """Add the map to the scene, or replace the scanner's map of this quantity, and return the line to report."""
         collection = bpy.data.collections.get(owner)  # None if it has been removed since
         maps = (map_ for map_ in volumes.volume_objects(scene) if volumes.quantity_of(map_) == quantity)
-        item = next((map_ for map_ in maps if _belongs_to(map_, collection)), None)
-        if item is not None:
+        if (item := next((map_ for map_ in maps if _belongs_to(map_, collection)), None)) is not None:
             volumes.replace_stored(item, stored)
         else:
             item = volumes.add_stored(stored, name, scene.collection)

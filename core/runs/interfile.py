@@ -109,8 +109,7 @@ class _Header:
     def pixel_size(self, axis: int) -> float:
         """Return the size of a pixel along axis 1 or 2, mm; NaN where the header says none."""
         for key in self.values:
-            match = re.fullmatch(rf"scaling factor( \((.*)\))? \[{axis}\]", key)
-            if match is not None:
+            if (match := re.fullmatch(rf"scaling factor( \((.*)\))? \[{axis}\]", key)) is not None:
                 size = stated_duration(self.text(key), key)
                 unit = (match[2] or "").replace(" ", "")
                 if unit not in _MILLIMETRES and not math.isnan(size):

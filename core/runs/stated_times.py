@@ -57,8 +57,7 @@ def moment(day: object, clock: object, name: str) -> float:
     seconds = 0.0
     if day_text:
         refusal = f"{name}: date {day_text}: expected year, month and day, such as 2024:03:01"
-        match = _DATE.fullmatch(day_text)
-        if match is None:
+        if (match := _DATE.fullmatch(day_text)) is None:
             raise InputError(refusal)
         with expecting(refusal):
             seconds = DAY * date(*map(int, filter(None, match.groups()))).toordinal()

@@ -112,8 +112,7 @@ class Sheet:
 
         A formula without a reliable value gives an `UncomputedValue` or an `OutdatedValue`.
         """
-        cell = self.cells.get((row, column))
-        if cell is None:
+        if (cell := self.cells.get((row, column))) is None:
             return None
         value = cell.value
         if cell.formula is not None:

@@ -365,8 +365,7 @@ def _read_value(cell_type: str, children: dict[str, Element], strings: list[str]
     text = children["v"].text
     if cell_type == "str":
         return unescaped(text)
-    text = text.strip()
-    if not text:
+    if not (text := text.strip()):
         return None
     try:
         if cell_type == "s":

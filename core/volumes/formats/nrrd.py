@@ -189,8 +189,7 @@ def _axis_positions(header: dict[str, Any]) -> tuple[np.ndarray, np.ndarray | No
         if np.any(n_steps < 1):
             raise InputError("axis maxs: an axis of one node has no spacing; expected spacings and axis mins")
         steps = (high - low) / n_steps
-    spacings = _spacings(header, steps, "axis mins and maxs")
-    if spacings is None:
+    if (spacings := _spacings(header, steps, "axis mins and maxs")) is None:
         raise InputError("axis mins: expected spacings or axis maxs beside them")
     return spacings, low + np.where(is_node, 0.0, spacings / 2), assumptions
 
@@ -220,8 +219,7 @@ def _numbers(header: dict[str, Any], name: str) -> np.ndarray | None:
 
 def _unit_lengths(header: dict[str, Any], name: str) -> np.ndarray | None:
     """Return the three units of length of a field, mm, or None if the field is missing."""
-    units = header.get(name)
-    if units is None:
+    if (units := header.get(name)) is None:
         return None
     if len(units) != 3 or any(unit.strip() not in _MILLIMETRES for unit in units):
         raise InputError(f"{name} {' '.join(units)}: expected mm, cm, m or um for each of three axes")

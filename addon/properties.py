@@ -154,16 +154,12 @@ class ScannerProperties(bpy.types.PropertyGroup):
     calibration: StringProperty(name="Calibration", description="Result of the last calibration, lines as JSON")
 
 
-def _is_scanner(self: GeometryProperties, collection: bpy.types.Collection) -> bool:
-    """Return whether a collection can be chosen as the scanner."""
-    return collection.mphdrr_scanner.is_scanner
-
-
 class GeometryProperties(bpy.types.PropertyGroup):
     """State of the Geometry panel; `Scene.mphdrr_geometry`."""
 
     scanner: PointerProperty(name="Scanner", description="Scanner that the panels work on: the active object's",
-                             type=bpy.types.Collection, poll=_is_scanner, update=on_edit("scanner_chosen"))  # fmt: skip
+                             type=bpy.types.Collection, poll=lambda self, item: item.mphdrr_scanner.is_scanner,
+                             update=on_edit("scanner_chosen"))  # fmt: skip
     active_index: IntProperty(name="Active Module", description="Index in the list", update=on_edit("active_module"))
     all_at_once: BoolProperty(name="All Modules", description="Show and change all modules, not the active one alone")
     first: IntProperty(name="First", description="First module number of the range", default=1)

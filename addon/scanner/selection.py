@@ -80,8 +80,7 @@ def after_update(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None
 
 def scanner_chosen(scene: bpy.types.Scene) -> None:
     """Make the first module of a scanner active that was chosen in the panel."""
-    collection = scanner.active_scanner(scene)
-    if collection is not None and not following.is_writing():
+    if (collection := scanner.active_scanner(scene)) is not None and not following.is_writing():
         _activate_in_list(scene, next(iter(scanner.modules(collection)), None))
 
 

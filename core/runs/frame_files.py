@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from ..arrays import Array, Floats
-from ..errors import InputError, reading, warn
+from ..errors import InputError, reading
 from ..files import AnyPath, require_file
 from ..hdf5 import datasets, opened, read_numbers
 from ..progress import Progress, tell
@@ -111,9 +111,7 @@ def read_counts(
     counts = counts_of_files[0] if len(counts_of_files) == 1 else np.concatenate(counts_of_files).view(Counts)
     counts.about = np.concatenate([file_counts.about for file_counts in counts_of_files])
     names = [file.name for file in paths]
-    starts, assumption = aligned_starts([file_counts.about[:, 4] for file_counts in counts_of_files], names)
-    if assumption:
-        warn(assumption)
+    starts = aligned_starts([file_counts.about[:, 4] for file_counts in counts_of_files], names)
     counts.about[:, 4] = starts - np.min(starts, initial=np.inf, where=np.isfinite(starts))
     counts.kind = ", ".join(sorted({file_counts.kind for file_counts in counts_of_files} - {""}))
     counts.name = ", ".join([*names[:3], *(["…"] if len(names) > 3 else [])])

@@ -220,8 +220,7 @@ def _compare_with_record(run: ProjectionRun, recipe: Recipe, has_mu: bool) -> No
         expected["mu"] = None
     names = [name for name in expected if name in record and f"model.{name}" not in SAMPLING]
     pairs = ((name, record[name], expected[name]) for name in names)
-    differences = [f"{name} {old}, not {new}" for name, old, new in pairs if not _is_close(new, old)]
-    if differences:
+    if differences := [f"{name} {old}, not {new}" for name, old, new in pairs if not _is_close(new, old)]:
         warn(f"the run's record says of its model: {'; '.join(differences)} as in the model that is given", 3)
 
 

@@ -8,7 +8,7 @@ from itertools import pairwise
 import numpy as np
 
 from ..arrays import Floats
-from ..errors import InputError, expecting
+from ..errors import InputError, expecting, warn
 
 DAY = 86400.0
 """Length of a day, s."""
@@ -72,8 +72,8 @@ def moment(day: object, clock: object, name: str) -> float:
     return seconds + 3600.0 * hours + 60.0 * minutes + rest
 
 
-def aligned_starts(starts: list[Floats], names: list[str]) -> tuple[Floats, str]:
-    """Return the moments, s, of the frames of several files one after the other, and a text to warn of ("" for none).
+def aligned_starts(starts: list[Floats], names: list[str]) -> Floats:
+    """Return the moments, s, of the frames of several files one after the other; warn where a day has to be assumed.
 
     Raises `InputError` where some files state a date and others none, or where only dates could tell the order.
     """
@@ -84,16 +84,17 @@ def aligned_starts(starts: list[Floats], names: list[str]) -> tuple[Floats, str]
         undated = next(k for k in stated if k not in dated)
         pair = f"{names[undated]}: its start has no date, that of {names[dated[0]]} has"
         raise InputError(f"{pair}; expected a date in both")
-    days, text = dict.fromkeys(stated, 0.0), ""
-    for previous, k in [] if dated else list(pairwise(stated)):
+    days = dict.fromkeys(stated, 0.0)
+    for previous, k in () if dated else pairwise(stated):
         gap = firsts[k] - firsts[previous]
         clocks = f"{_clock(firsts[previous])} and {_clock(firsts[k])}"
         pair = f"{names[previous]} and {names[k]} start at {clocks}, without a date"
         if gap > _HALF_DAY:
             raise InputError(f"{pair}: which is earlier? expected dates, or the files in the order of time")
         days[k] = days[previous] + DAY * (gap < -_HALF_DAY)
-        text = text or (f"{pair}: the later one is taken to be of the next day" if gap < -_HALF_DAY else "")
-    return np.concatenate([of_file + days.get(k, 0.0) for k, of_file in enumerate(starts)]), text
+        if days[k] > days[previous] == 0:
+            warn(f"{pair}: the later one is taken to be of the next day")
+    return np.concatenate([of_file + days.get(k, 0.0) for k, of_file in enumerate(starts)])
 
 
 def _clock(seconds: float) -> str:

@@ -22,10 +22,6 @@ class ScipyOperator(ScipyLinearOperator):
         """Return the adjoint of the images in the columns of X, as columns."""
         return _apply_to_columns(self._operator.T, X)
 
-    def _matvec(self, x: Array) -> Array:
-        """Return the images of a flat volume, flat."""
-        return self._matmat(x.reshape(-1, 1))[:, 0]
-
     def _rmatvec(self, x: Array) -> Array:
         """Return the adjoint of flat images, flat."""
         return self._rmatmat(x.reshape(-1, 1))[:, 0]

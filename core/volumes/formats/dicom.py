@@ -308,7 +308,7 @@ def _sort_slices(slices: list[_Slice]) -> tuple[list[_Slice], Floats]:
     ras_normal = RAS_FROM_LPS[:3, :3] @ normal
     normal = normal * np.sign(ras_normal[np.abs(ras_normal).argmax()])
     slices = sorted(slices, key=lambda image: float(image.position @ normal))
-    first, last = slices[0], slices[-1]
+    first = slices[0]
     if len(slices) == 1:
         if not first.thickness > 0:
             raise InputError(f"{first.name}: a single slice without a SliceThickness")
@@ -334,15 +334,13 @@ def _sort_slices(slices: list[_Slice]) -> tuple[list[_Slice], Floats]:
     if median > 1.5 * first.thickness > 0:
         text = f"the slices are {first.thickness:g} mm thick and lie {median:g} mm apart: there are gaps between them, "
         warn(f"{text}or some are missing")
-    step = (last.position - first.position) / (len(slices) - 1)
     offsets = positions - first.position
-    sideways = offsets - np.outer(offsets @ normal, normal)
     fractions = (heights - heights[0]) / (heights[-1] - heights[0])
-    deviations = np.linalg.norm(sideways - np.outer(fractions, sideways[-1]), axis=1)
+    deviations = np.linalg.norm(offsets - np.outer(fractions, offsets[-1]), axis=1)
     if deviations.max() > 0.1 * min(first.spacing):
         worst = slices[int(deviations.argmax())]
         raise InputError(f"{worst.name} lies {deviations.max():.3g} mm beside the other slices")
-    return slices, step
+    return slices, offsets[-1] / (len(slices) - 1)
 
 
 def _decimals(number: float) -> int:

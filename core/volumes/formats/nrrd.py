@@ -199,8 +199,7 @@ def _spacings(header: dict[str, Any], steps: np.ndarray | None = None, source: s
 
     `InputError` where both are stated and differ.
     """
-    spacings = _numbers(header, "spacings")
-    if spacings is None or steps is None:
+    if (spacings := _numbers(header, "spacings")) is None or steps is None:
         return spacings if steps is None else steps
     if np.any(np.abs(spacings - steps) > _SAME * np.abs(steps)):
         raise InputError(f"spacings and {source} say different lengths: {_text(spacings)} and {_text(steps)}")

@@ -179,7 +179,7 @@ def test_the_tutorials_images_and_gradients_are_those_of_the_module(ct, form, op
         torch.cat([POSE.matrix, torch.eye(4)[None]]),
     )  # and from within
     recon.density.data = subject.density.clone()
-    recon.drr.density = recon.drr.density.clone().requires_grad_()
+    recon.drr.density = torch.nn.Parameter(recon.drr.density)
     results = []
     for image, density in (
         (recon(RigidTransform(poses)), recon.density), (recon.drr(RigidTransform(poses)), recon.drr.density),

@@ -46,7 +46,7 @@ def is_transformed(value: object) -> bool:
 
 
 def uncompiled(function: Callable[P, R]) -> Callable[P, R]:
-    """Decorate a `function` that torch.compile leaves as it is: a break of the graph."""
+    """Return `function` with a break of the graph around it in torch.compile, which does not compile it."""
 
     @functools.wraps(function)
     def call(*args: P.args, **kwargs: P.kwargs) -> R:

@@ -15,6 +15,8 @@ import pytest
 import mphdrr.core as mph
 from mphdrr.core.cli import main
 
+from ..core.conftest import WORKBOOK
+
 pydicom = pytest.importorskip("pydicom")
 
 TO_FILE = {"activity": 1e3, "mu": 10.0, "hu": 1.0}
@@ -207,3 +209,37 @@ def test_a_note_of_the_volume_is_kept(rng, tmp_path):
     volume = made(rng, "activity")
     mph.write_volume(mph.Volume(volume.array, volume.grid, "activity", "made by a network"), tmp_path / "v.dcm")
     assert pydicom.dcmread(tmp_path / "v.dcm").ImageComments == "made by a network"
+
+
+@pytest.mark.parametrize("detector", ["virtual", "real"])
+@pytest.mark.parametrize("time", [600.0, 0.25])
+def test_counts_read_back_with_time_window_and_pixels(rng, tmp_path, detector, time):
+    modules = mph.read_system(WORKBOOK)[np.array([0, 7, 79])]
+    model = mph.Emission(modules, time=time, isotope="Tc-99m", window=(130.0, 151.5))
+    volume = mph.Volume(rng.random((8, 8, 8)) * 1e4 / time, mph.Grid.centered(8, 4.0), "activity")
+    run = mph.project_run(modules, volume, (16, 12), detector, model=model, noise_seed=3)
+    mph.write_counts(run, tmp_path / "c.dcm", tags={"PatientID": "phantom"})
+    counts = mph.read_counts(tmp_path / "c.dcm")
+    again = mph.counts_run(counts, modules, [int(n) for n in modules.numbers], "back-v", detector=detector)
+    np.testing.assert_array_equal(again.projections, run.projections)
+    assert again.recipe["model.time"] == time
+    np.testing.assert_allclose(counts.about[:, 5:], [[130.0, 151.5]] * 3)
+    assert pydicom.dcmread(tmp_path / "c.dcm").PatientID == "phantom"
+    mph.write_run(again, tmp_path / "again.dcm")
+    np.testing.assert_array_equal(mph.read_counts(tmp_path / "again.dcm"), counts)
+
+
+def test_runs_that_are_no_planar_image_are_refused(rng, tmp_path):
+    modules = mph.read_system(WORKBOOK)[np.array([0, 7])]
+    volume = mph.Volume(rng.random((8, 8, 8)), mph.Grid.centered(8, 4.0), "activity")
+    fast = mph.Emission(modules, time=0.0005)
+    runs = {
+        "expected a run of counts": mph.project_run(modules, volume, (8, 8)),
+        "exposure in whole milliseconds": mph.project_run(modules, volume, (8, 8), model=fast),
+    }
+    for words, run in runs.items():
+        with pytest.raises(mph.InputError, match=words):
+            mph.write_counts(run, tmp_path / "c.dcm")
+    with pytest.raises(mph.InputError, match=r"c\.h5: expected a name ending in \.dcm"):
+        mph.write_counts(run, tmp_path / "c.h5")
+    assert not list(tmp_path.iterdir())

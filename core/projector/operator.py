@@ -313,8 +313,7 @@ class Projector(LinearOperator):
         self._require_rays()
         execution = self._execution(x)
         for m, image in enumerate(self._plain_images(execution, x, mu)):
-            response = self.model.response(self.views, m)
-            if response is not None:
+            if (response := self.model.response(self.views, m)) is not None:
                 along_v, along_u = (cast_like(matrix, image) for matrix in response)
                 image = along_v @ image @ along_u.T
             if self._efficiency is not None:  # the projectors of close voxels have their own
@@ -363,8 +362,7 @@ class Projector(LinearOperator):
         if self._efficiency is not None:
             images = images * cast_like(self._efficiency, images)
         for m in range(len(self.views)):
-            response = self.model.response(self.views, m)
-            if response is None:
+            if (response := self.model.response(self.views, m)) is None:
                 return images
             if m == 0:
                 images = images + 0  # a copy: the caller's images stay as they are

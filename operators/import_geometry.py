@@ -177,6 +177,5 @@ class MPHDRR_OT_import_geometry(bpy.types.Operator):
     def _ask_columns(self, context: bpy.types.Context) -> set[str]:
         """Open the column map dialog."""
         self._dialog = "COLUMNS"
-        return context.window_manager.invoke_props_dialog(
-            self, width=column_map_dialog.WIDTH, title=f"Columns of {self._workbook().name}", confirm_text="Import"
-        )
+        texts = {"title": f"Columns of {self._workbook().name}", "confirm_text": "Import"}
+        return context.window_manager.invoke_props_dialog(self, width=column_map_dialog.WIDTH, **texts)

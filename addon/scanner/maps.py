@@ -75,9 +75,8 @@ mapping = map_job  # the name in version 0.2.0, for scripts
 def _belongs_to(item: bpy.types.Object, collection: bpy.types.Collection | None) -> bool:
     """Return whether a volume is a map of a scanner; maps of earlier versions, which name no scanner, belong to any."""
     settings = item.mphdrr_volume
-    return settings.scanner == collection or (
-        settings.scanner is None and item.name.startswith(_map_name(settings.quantity))
-    )
+    is_of_any = settings.scanner is None and item.name.startswith(_map_name(settings.quantity))
+    return settings.scanner == collection or is_of_any
 
 
 def _map_name(quantity: str) -> str:

@@ -75,10 +75,8 @@ def _table(rows: list[dict[str, Any]]) -> list[str]:
     """Return a line of text for each event, below a heading."""
     names = max(7, *(len(str(row["phantom"])) for row in rows))
     splits = max(5, *(len(row["split"] or "") for row in rows))
-    heading = f"{'event':>6}  {'phantom':<{names}}  {'split':<{splits}}" + "".join(
-        f"{text:>9}" for text in ("x mm", "y mm", "z mm", "phi °", "theta °", "psi °")
-    )
-    lines = [heading]
+    titles = "".join(f"{text:>9}" for text in ("x mm", "y mm", "z mm", "phi °", "theta °", "psi °"))
+    lines = [f"{'event':>6}  {'phantom':<{names}}  {'split':<{splits}}{titles}"]
     for row in rows:
         numbers = "".join(f"{row[column]:9.2f}" for column in _COLUMNS)
         lines.append(f"{row['event']:6d}  {row['phantom']:<{names}}  {row['split'] or '':<{splits}}{numbers}")

@@ -89,9 +89,7 @@ def _single_axis(header: dict[str, Any]) -> int | None:
     axis = max(range(4), key=lambda axis: (sizes[axis] == 1, kinds[axis] not in _SPATIAL, axis))
     for name in ("sizes", "kinds", "spacings", "axis mins", "axis maxs", "centerings", "units", "space directions"):
         if len(values := header.get(name, ())) == 4:
-            header[name] = np.delete(np.asarray(values), axis, axis=0) if name != "kinds" else [
-                kind for index, kind in enumerate(values) if index != axis
-            ]  # fmt: skip
+            header[name] = np.delete(np.asarray(values), axis, axis=0)
     return axis
 
 

@@ -134,6 +134,7 @@ def reader(item: bpy.types.Object, path: Path | None = None) -> Callable[[], Vol
 def file_and_pose(item: bpy.types.Object, path: Path | None = None) -> tuple[Path, NDArray[np.float64]]:
     """Return the file with every voxel of a Volume object, and its pose (4, 4), mm; `InputError` where there is no file."""
     require_volume(item)
+    objects.require_evaluated([item])
     if path is None and _frame_number(item.data) is None:
         raise InputError(f"{item.name!r} has no state at frame {bpy.context.scene.frame_current}")
     pose, path = pose_of_object(item), path or file_of(item)

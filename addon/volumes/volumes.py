@@ -271,7 +271,8 @@ def _volume_data(stored: StoredVolume, name: str) -> bpy.types.Volume:
 def _load_files(data: bpy.types.Volume, stored: StoredVolume) -> None:
     """Make a datablock show a stored volume; where Blender cannot load the file, it keeps the previous one."""
     previous = data.is_sequence, data.filepath
-    data.is_sequence, data.filepath = False, storage.stored_path(stored.path)
+    path = storage.adopt(stored.path)
+    data.is_sequence, data.filepath = False, storage.stored_path(path)
     error = ""
     # A successful load keeps the error message of an earlier failed one, as after a crash; unloading drops it.
     data.grids.load()
@@ -282,7 +283,7 @@ def _load_files(data: bpy.types.Volume, stored: StoredVolume) -> None:
         error = f"Blender finds no grid {stored.volume.quantity!r} in it"
     if error:
         data.is_sequence, data.filepath = previous
-        raise InputError(f"{stored.path}: {error}")
+        raise InputError(f"{path}: {error}")
     # The active grid is the one that the solid viewport draws.
     data.grids.active_index = data.grids.find(vdb.SMOKE if vdb.SMOKE in data.grids else stored.volume.quantity)
     if len(stored.states) > 1:  # set after loading: a sequence would look for frame 0 until the scene is evaluated

@@ -15,11 +15,14 @@ from mathutils import Matrix
 from numpy.typing import ArrayLike, NDArray
 
 from ...core import InputError, Volume, memory
+from ...core.errors import warn
 from ...core.geometry.frames import checked_affine
 from ...core.progress import Progress, stages_of
 from ..blender import compat, ids, jobs, objects, reports, storage
 from . import vdb, volume_materials
 from .stored_volumes import StoredVolume, move_grid, store_volume, write_states
+
+_MICROMETER = 1e-3  # mm
 
 
 def add_volume(
@@ -44,10 +47,18 @@ def add_volume(
 
 def add_stored(stored: StoredVolume, name: str, collection: bpy.types.Collection | None = None) -> bpy.types.Object:
     """Put a stored volume into the scene as a Volume object with a material."""
+    _check_voxel_size(name, stored.volume.grid.spacing)
     item = bpy.data.objects.new(name, _volume_data(stored, name))
     (collection or bpy.context.scene.collection).objects.link(item)
     _set_properties(item, stored)
     return item
+
+
+def _check_voxel_size(name: str, spacing: ArrayLike) -> None:
+    """Warn of voxels below a micrometre, as of meshes that were made in metres."""
+    if np.min(spacing) < _MICROMETER:
+        advice = "a unit of the scene is 1 mm, so scale by 1000 what was made in metres"
+        warn(f"{name!r} has voxels of {np.min(spacing):.3g} mm, below a micrometre: {advice}")
 
 
 def add_volume_job(
@@ -128,6 +139,7 @@ def reader(item: bpy.types.Object, path: Path | None = None) -> Callable[[], Vol
     `path` is the file of a state (`storage.state_files`), by default that of the current frame.
     """
     path, pose = file_and_pose(item, path)
+    _check_voxel_size(item.name, item.mphdrr_volume.spacing * np.linalg.norm(pose[:3, :3], axis=0))
     return lambda: move_grid(vdb.read_vdb(path), pose)
 
 

@@ -25,10 +25,8 @@ from ...core.files import ensure_folder, replacing
 from ...core.memory import readable_size
 from . import ids
 
-_OUR_VOLUME = re.compile(r"[a-z]+-[0-9a-f]{16}(\.preview)?(_\d{4})?\.(vdb|h5)")
-"""Names of the files that `stored_volumes` writes, made from their content."""
-_OUR_RUN = re.compile(r".*-projections-[0-9a-f]{8}\.h5")  # names of run files
-_OUR_STEM = re.compile(r"[a-z]+-[0-9a-f]{16}|.*-projections-[0-9a-f]{8}")  # what the files of one result have in common
+_OURS = re.compile(r"([a-z_]+-[0-9a-f]{16}|.*-projections-[0-9a-f]{8})(\.preview)?(_\d{4})?\.(vdb|h5)")
+"""Names of files that `stored_volumes` writes, made from their content, and of run files; all of a result begin alike."""
 _ENDING = re.compile(r"\.[A-Za-z]\w*$")  # a file's ending; a folder, or a number typed in place of a file, has none
 _FRAME = re.compile(r"_\d{4}\.vdb$")  # the frame number at the end of the names of a sequence's files
 
@@ -113,7 +111,7 @@ def _cached_size(path: Path, interval: float) -> int | None:
 
 def missing_volumes() -> list[bpy.types.Volume]:
     """Return our volumes that miss a file, the shown one or the one with every voxel."""
-    our_volumes = [data for data in bpy.data.volumes if _OUR_VOLUME.fullmatch(absolute(data.filepath).name)]
+    our_volumes = [data for data in bpy.data.volumes if _OURS.fullmatch(absolute(data.filepath).name)]
     return [data for data in our_volumes if any(file_size(path) is None for path in _files_of(data))]
 
 
@@ -155,8 +153,8 @@ def _file_name(path: str | Path) -> str:
 def unused_volumes() -> list[Path]:
     """Return the voxel files and run files in this .blend's folder that none of its volumes and lists of runs needs."""
     used_names = _used_names()
-    our_files = [p for p in _folder().glob("*") if _OUR_VOLUME.fullmatch(p.name) or _OUR_RUN.fullmatch(p.name)]
-    return sorted(path for path in our_files if path.is_file() and path.name not in used_names)
+    our_files = [path for path in _folder().glob("*") if _OURS.fullmatch(path.name) and path.is_file()]
+    return sorted(path for path in our_files if path.name not in used_names)
 
 
 def _used_names() -> set[str]:
@@ -170,10 +168,10 @@ def adopt(path: Path) -> Path:
 
     After a Save As in the meantime, all files of the result move there; those that the other .blend needs are copied.
     """
-    stem = _OUR_STEM.match(path.name)
-    if stem is None or path.parent == _folder() or path.parent not in _left_folders:
+    match = _OURS.fullmatch(path.name)
+    if match is None or path.parent == _folder() or path.parent not in _left_folders:
         return path
-    for file in list(path.parent.glob(f"{glob.escape(stem[0])}*")):
+    for file in list(path.parent.glob(f"{glob.escape(match[1])}*")):
         _copy_into(file, _folder())
         _remove_left(file)
     return _folder() / path.name
@@ -419,7 +417,7 @@ def _is_too_large(file: Path, size: int, target: Path) -> bool:
 
 def _copy_into(file: Path, target: Path) -> Path:
     """Copy a file into a folder, under a new name if a different file has its name, and return the copy's path."""
-    is_ours = _OUR_VOLUME.fullmatch(file.name) or _OUR_RUN.fullmatch(file.name)
+    is_ours = _OURS.fullmatch(file.name)
     path, number = ensure_folder(target) / file.name, 2
     while path.exists():
         if is_ours or filecmp.cmp(file, path, shallow=False):

@@ -17,7 +17,7 @@ from mphdrr.addon.phantoms import phantom_properties, phantoms  # noqa: E402
 from mphdrr.addon.reconstruction import backprojections, reconstructions  # noqa: E402
 from mphdrr.addon.runs import rendering, runs  # noqa: E402
 from mphdrr.addon.scanner import maps  # noqa: E402
-from mphdrr.addon.volumes import volumes  # noqa: E402
+from mphdrr.addon.volumes import volume_import, volumes  # noqa: E402
 from mphdrr.core.progress import Cancelled  # noqa: E402
 
 from ..blender.conftest import derenzo, registered, ring, ring_system, scene  # noqa: E402
@@ -62,7 +62,12 @@ def sensitivity_map() -> jobs.Job:
     return maps.map_job(bpy.context.scene, "sensitivity", voxels=8)
 
 
-JOBS = [phantom, beating, projections, frames, reconstruction, backprojection, sensitivity_map]
+def dose() -> jobs.Job:
+    """Return a job whose quantity has two words."""
+    return volume_import.dose_job(bpy.data.objects["Derenzo"], "Tc-99m")
+
+
+JOBS = [phantom, beating, projections, frames, reconstruction, backprojection, sensitivity_map, dose]
 
 
 @pytest.fixture

@@ -108,6 +108,7 @@ if TYPE_CHECKING:
     from .reconstruction.stopping import StoppingRule, StopWhen
     from .reconstruction.tv import tv
     from .runs.backprojecting import backproject_run, run_line_integrals
+    from .runs.dicom_counts import write_counts
     from .runs.files import read_run, write_run
     from .runs.frame_files import read_counts
     from .runs.measured import counts_run

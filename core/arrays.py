@@ -2,7 +2,8 @@
 
 import functools
 import sys
-from typing import Any
+from collections.abc import Callable
+from typing import Any, ParamSpec, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike as ArrayLike
@@ -18,6 +19,8 @@ Indexes = NDArray[np.intp]
 Integers = NDArray[np.int64]
 Bytes = NDArray[np.uint8]
 Array = NDArray[Any]  # an array of any type
+P = ParamSpec("P")
+R = TypeVar("R")
 ArrayOrTensor = Any  # a numpy array or a torch tensor; torch may not be installed
 
 
@@ -35,6 +38,23 @@ def namespace(*values: ArrayOrTensor) -> Any:
 def is_double(value: object) -> bool:
     """Return whether `value` is a torch tensor of float64."""
     return is_tensor(value) and str(value.dtype) == "torch.float64"  # type: ignore[attr-defined]
+
+
+def is_transformed(value: object) -> bool:
+    """Return whether `value` is a tensor that torch.func (vmap, grad, jvp ...) transforms: its numbers cannot be read."""
+    return is_tensor(value) and sys.modules["torch"]._C._are_functorch_transforms_active()
+
+
+def uncompiled(function: Callable[P, R]) -> Callable[P, R]:
+    """Return `function` with a break of the graph around it in torch.compile, which does not compile it."""
+
+    @functools.wraps(function)
+    def call(*args: P.args, **kwargs: P.kwargs) -> R:
+        torch: Any = sys.modules.get("torch")
+        is_compiling = torch is not None and torch.compiler.is_compiling()
+        return (torch.compiler.disable(function) if is_compiling else function)(*args, **kwargs)
+
+    return call
 
 
 def checked(
@@ -69,6 +89,9 @@ def checked(
 
 def require_numbers(tensor: Any, name: str) -> None:
     """Raise `InputError` unless `tensor` is a dense tensor of real numbers that is in memory."""
+    if is_transformed(tensor):
+        advice = "which works with the volume of a projector alone: take autograd, or a loop"
+        raise InputError(f"{name}: expected a tensor outside torch.func, {advice}")
     if tensor.is_complex() or tensor.is_quantized or tensor.is_meta or str(tensor.layout) != "torch.strided":
         kind = f"{tensor.dtype}, {tensor.layout}, on {tensor.device}"
         raise InputError(f"{name}: expected a dense tensor of real numbers, got {kind}")

@@ -1,6 +1,7 @@
 """File > Export > Volume: write the active volume, at its place in the world, for other programs."""
 
 import bpy
+from bpy.props import StringProperty
 
 from ..addon.blender import file_properties, jobs, reports
 from ..addon.phantoms.volume_export import WRITTEN_ENDINGS, export_job
@@ -15,6 +16,13 @@ class MPHDRR_OT_export_volume(jobs.ExportJob, bpy.types.Operator):
     filepath: file_properties.file_property("File to write")
     filter_glob: file_properties.shown_files(WRITTEN_ENDINGS)
 
+    template: StringProperty(
+        name="Template",
+        description="DICOM file of which a .dcm takes the tags of patient, study and series",
+        subtype="FILE_PATH",
+    )
+    tags: StringProperty(name="Tags", description="Such tags for a .dcm: PatientName=Doe^Jo; SeriesDescription=OSEM")
+
     poll = reports.needs(volumes.ACTIVE)
 
     def ask(self, context: bpy.types.Context) -> set[str] | None:
@@ -25,4 +33,5 @@ class MPHDRR_OT_export_volume(jobs.ExportJob, bpy.types.Operator):
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
         path = self.required_file(f"expected a name ending in {', '.join(WRITTEN_ENDINGS)}")
-        return export_job(context.object, path)
+        template = bpy.path.abspath(self.template)
+        return export_job(context.object, path, template, self.tags)

@@ -13,7 +13,7 @@ from ..addon.pictures import images
 from ..addon.runs import projection_properties, rendering, runs
 from ..addon.scanner import scanner
 from ..core.errors import InputError
-from ..core.runs import FORMATS
+from ..core.runs import EXPORT_FORMATS, FORMATS
 from ..core.runs.presets import PRESETS
 
 
@@ -104,12 +104,12 @@ class MPHDRR_OT_show_projections(ShowPicture, bpy.types.Operator):
 
 
 class MPHDRR_OT_export_dataset(jobs.ExportJob, bpy.types.Operator):
-    """Write the shown run, with geometry, volume and provenance, as HDF5 (.h5), NumPy (.npz) or PyTorch (.pt)."""
+    """Write the shown run, with geometry, volume and provenance, as .h5, .npz or .pt (PyTorch), or its counts as DICOM."""
 
     bl_label = "Export mphDRR Dataset"
 
-    endings = FORMATS
-    filter_glob: file_properties.shown_files(FORMATS)
+    endings = EXPORT_FORMATS
+    filter_glob: file_properties.shown_files(EXPORT_FORMATS)
 
     def draw(self, context: bpy.types.Context) -> None:
         """Draw the changes of the scene since the run, beside the file browser."""
@@ -117,5 +117,5 @@ class MPHDRR_OT_export_dataset(jobs.ExportJob, bpy.types.Operator):
             self.layout.label(text=line, icon="ERROR")
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
-        path = self.required_file("set filepath to a name ending in .h5, .npz or .pt")
+        path = self.required_file("set filepath to a name ending in .h5, .npz, .pt or .dcm")
         return rendering.export_job(context.scene, path)

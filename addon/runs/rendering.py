@@ -155,7 +155,7 @@ def _set_physics(scene: bpy.types.Scene, recipe: Recipe) -> None:
 
 
 def export_job(scene: bpy.types.Scene, path: Path) -> jobs.Job:
-    """Return the job that writes the shown run to a file, in the format of its suffix: .h5, .npz or .pt.
+    """Return the job that writes the shown run to a file, in the format of its suffix: .h5, .npz, .pt or .dcm.
 
     Warns where the scene has changed since the run was made.
     """

@@ -3,7 +3,7 @@
 import argparse
 
 from ... import core as mph
-from ..runs import FORMATS
+from ..runs import EXPORT_FORMATS, FORMATS
 from ..runs.mosaic import write_sheet
 from .options import add_run, output_path
 
@@ -13,7 +13,8 @@ def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
     parser, formats = add_run(subparsers, "export", _run), ", ".join(FORMATS)
     add = parser.add_argument
     add("file", metavar="RUN", help=f"a run written by mphDRR: {formats}")
-    add("-o", "--output", action="append", default=[], metavar="FILE", help=f"{formats}; may be repeated")
+    output = f"{formats}, or the counts alone as .dcm; may be repeated"
+    add("-o", "--output", action="append", default=[], metavar="FILE", help=output)
     add("--mosaic", metavar="PNG", help="all images in one picture")
 
 
@@ -25,7 +26,7 @@ def _run(arguments: argparse.Namespace) -> None:
     if not arguments.output and not arguments.mosaic:
         raise mph.InputError("nothing to write: give --output FILE or --mosaic PNG")
     run = mph.read_run(arguments.file)
-    paths = [output_path(name, FORMATS) for name in arguments.output]
+    paths = [output_path(name, EXPORT_FORMATS) for name in arguments.output]
     picture = output_path(arguments.mosaic) if arguments.mosaic else None
     for path in paths:
         mph.write_run(run, path)

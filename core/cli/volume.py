@@ -9,6 +9,7 @@ from ... import core as mph
 from ..geometry.grid import grid_around
 from ..physics.isotopes import photon_energy
 from ..validation import positive, real_array, shape_text
+from ..volumes.formats.dicom_writing import tags_of
 from ..volumes.meshes.mesh import MESH_FORMATS, MILLIMETRES
 from ..volumes.volume import UNITS
 from ..volumes.volume_files import VOLUME_FORMATS
@@ -45,6 +46,10 @@ def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
     energy = "photon energy, or an isotope's name for its strongest line (default: 140.5)"
     convert.add_argument("--energy", metavar="KEV", help=energy)
     convert.add_argument("-o", "--output", required=True, metavar="FILE", help=", ".join(VOLUME_FORMATS))
+    template = "DICOM file of which .dcm takes the tags of patient, study and series"
+    convert.add_argument("--template", metavar="FILE", help=template)
+    tag = "such a tag, as PatientName=Doe^Jo; may be repeated"
+    convert.add_argument("--tag", action="append", default=[], metavar="KEYWORD=VALUE", help=tag)
 
     from_mesh = add_run(actions, "from-mesh", _from_mesh)
     add = from_mesh.add_argument
@@ -117,6 +122,7 @@ def _convert(arguments: argparse.Namespace) -> None:
 
     mphdrr volume convert dicom_folder --center --spacing 2 --to-mu --energy Tc-99m -o mu.nii.gz
     mphdrr volume convert mu70.nii.gz --from-mu 70 --to-mu --energy Tc-99m -o mu.nii.gz
+    mphdrr volume convert osem.nii.gz --template ct/0001.dcm --tag SeriesDescription=OSEM -o osem.dcm
     """
     path = output_path(arguments.output, VOLUME_FORMATS)
     if arguments.energy is not None and not arguments.to_mu:
@@ -139,7 +145,7 @@ def _convert(arguments: argparse.Namespace) -> None:
         volume = mph.mu_to_hu(volume, photon_energy(arguments.from_mu))
     if arguments.to_mu:
         volume = mph.hu_to_mu(volume, energy)
-    mph.write_volume(volume, path)
+    mph.write_volume(volume, path, template=arguments.template, tags=tags_of(arguments.tag))
     print(f"{path}: {describe_volume(volume)} {volume.unit}")
 
 

@@ -10,7 +10,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import Array, ArrayOrTensor, cast_like, checked, is_double, is_tensor, promote, to_caller, to_numpy, zeros
+from ..arrays import (
+    Array,
+    ArrayOrTensor,
+    cast_like,
+    checked,
+    is_double,
+    is_tensor,
+    promote,
+    to_caller,
+    to_numpy,
+    uncompiled,
+    zeros,
+)
 from ..errors import InputError, warn
 from ..geometry.grid import Grid
 from ..geometry.views import Views
@@ -125,6 +137,7 @@ class Projector(LinearOperator):
             self._parts = [Projector(grid, views, part, **self._settings) for part in parts if part is not model]
         self._pinholes = None if self._parts else model.by_depth(views, grid)
 
+    @uncompiled
     def __call__(
         self, x: Volume | ArrayOrTensor, progress: Progress | None = None, mu: ArrayOrTensor = None
     ) -> ArrayOrTensor:
@@ -245,7 +258,7 @@ class Projector(LinearOperator):
         values = to_numpy(array[sample], np.float32)
         is_air = np.isin(values, _PADDING) | (abs(values - AIR_HU) < 50)
         if np.count_nonzero(is_air) > 0.05 * is_air.size:
-            warn(f"volume: {np.mean(is_air):.0%} of its values are those of air in CT numbers{CONVERT}", 4)
+            warn(f"volume: {np.mean(is_air):.0%} of its values are those of air in CT numbers{CONVERT}", 6)
         return array
 
     def _run_one(self, x: ArrayOrTensor, progress: Progress | None = None, mu: ArrayOrTensor = None) -> ArrayOrTensor:

@@ -12,6 +12,7 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
+from ..arrays import is_tensor, require_numbers, uncompiled
 from ..errors import InputError
 from ..geometry.grid import Grid
 from ..models.pixel_points import TOLERANCE, lattice, lattices, points_needed, require_points, shadow_edges
@@ -108,6 +109,7 @@ def _fans(
     return torch.stack((positions, corners, pitch_v * v, pitch_u * u), dim=-2)
 
 
+@uncompiled
 def pinhole_images(
     volume: Volume | Tensor,
     positions: Tensor,
@@ -137,6 +139,7 @@ def pinhole_images(
     return trace_fans(volume, _fans(shape, *cameras), shape, backend, grid)
 
 
+@uncompiled
 def emission_images(
     volume: Volume | Tensor,
     positions: Tensor,
@@ -227,9 +230,12 @@ def emission_images(
         raise InputError("emission images: intrinsic_fwhm: expected 0; `gaussian_blur` makes the matrices of a blur")
     settings_by_name = optics.numbers
     crystal = [0.0 if x is None else x for x in (crystal_thickness, crystal_side)]
-    positions, rotations, l, diameter, thickness, side, time, *optics_numbers, pitch, offset = _cameras(
+    cameras = _cameras(
         positions, rotations, collimator_length, diameter, *crystal, time, *settings_by_name.values(), pitch, offset
     )
+    for x in filter(is_tensor, (volume, mu, *cameras)):
+        require_numbers(x, "emission images")
+    positions, rotations, l, diameter, thickness, side, time, *optics_numbers, pitch, offset = cameras
     named_numbers = dict(zip(settings_by_name, optics_numbers, strict=True))
     for name, x in (("collimator_length", l), ("diameter", diameter), ("pitch", pitch)):
         if bool((x <= 0).any()):
@@ -241,9 +247,9 @@ def emission_images(
         if aperture_points != 1 or pixel_points is not None:
             raise InputError("emission images: hole 'depth' takes no aperture_points and pixel_points")
         bounded_side = side if optics.within_crystal or optics.within_walls else None
-        cameras = CameraTensors(positions, rotations, l, diameter, bounded_side, thickness, pitch, offset)
+        pinholes = CameraTensors(positions, rotations, l, diameter, bounded_side, thickness, pitch, offset)
         optics = optics.with_numbers(named_numbers)
-        return depth_images(volume, volume_grid, cameras, (n_v, n_u), time, mu, mu_grid, optics)
+        return depth_images(volume, volume_grid, pinholes, (n_v, n_u), time, mu, mu_grid, optics)
 
     # Depth of the plane through the grid's farthest corner, in units of the distance from pinhole to crystal.
     corners = positions.new_tensor(volume_grid.corners()) - positions.detach()[..., None, :]

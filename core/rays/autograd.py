@@ -12,17 +12,27 @@ Gradients = Callable[[Tensor, Sequence[bool]], Sequence[Tensor | None]]
 
 
 def linear(forward: Callable[[Tensor], Tensor], adjoint: Callable[[Tensor], Tensor], x: Tensor) -> Tensor:
-    """Return ``forward(x)``, a linear map with that `adjoint`; differentiable to any order, in both modes."""
+    """Return ``forward(x)``, a linear map with that `adjoint`; differentiable to any order, in both modes.
+
+    Both maps take a batch, axes before those of `x`.
+    """
     return _Linear.apply(forward, adjoint, x)
 
 
 class _Linear(torch.autograd.Function):
-    """Linear map as a step: its derivative is the map itself, its gradient the adjoint."""
+    """Linear map as a step: its derivative is the map itself, its gradient the adjoint, a batch that of torch.func.vmap."""
 
     @staticmethod
-    def forward(ctx: Any, forward: Any, adjoint: Any, x: Tensor) -> Tensor:
-        ctx.maps = forward, adjoint
+    def forward(forward: Any, adjoint: Any, x: Tensor) -> Tensor:
         return forward(x.detach())
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
+        ctx.maps = inputs[:2]
+
+    @staticmethod
+    def vmap(_info: Any, in_dims: tuple[Any, ...], forward: Any, adjoint: Any, x: Tensor) -> tuple[Tensor, int]:
+        return linear(forward, adjoint, x.movedim(in_dims[2], 0)), 0
 
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> tuple[None, None, Tensor]:

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ..arrays import ArrayOrTensor, checked, is_tensor, zeros
+from ..arrays import ArrayOrTensor, checked, is_tensor, is_transformed, uncompiled, zeros
 from ..memory import require
 from ..progress import Progress, part_of
 from ..validation import shape_text
@@ -22,6 +22,7 @@ class LinearOperator(ABC):
     Both take a batch: the axes before those of `shape_in` come before those of `shape_out`.
     """
 
+    @uncompiled
     def __call__(self, x: Volume | ArrayOrTensor, progress: Progress | None = None) -> ArrayOrTensor:
         """Apply the operator.
 
@@ -43,15 +44,16 @@ class LinearOperator(ABC):
         InputError
             The volume is on another grid, or more memory is needed than there is.
         """
-        return self._apply(self._check(x), progress)
+        return self._apply(x if is_transformed(x) else self._check(x), progress)
 
     def _apply(self, x: ArrayOrTensor, progress: Progress | None = None, mu: ArrayOrTensor = None) -> ArrayOrTensor:
-        """Apply to a checked array or tensor, with its gradient in torch but not that of mu."""
+        """Apply to a checked array or tensor, or one of torch.func, with its gradient in torch but not that of mu."""
         if not is_tensor(x):
             return self._run(x, progress, mu)
         from .autograd import linear
 
-        return linear(lambda x: self._run(x, progress, mu), lambda y: self.T._run(y, mu=mu), x)
+        check = self._check if is_transformed(x) else lambda x: x
+        return linear(lambda x: self._run(check(x), progress, mu), lambda y: self.T._run(y, mu=mu), x)
 
     _names = ("array", "array")  # names in messages of the argument, and of the adjoint's argument
     _float64 = False  # whether it computes in float64 also from float32

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..arrays import ArrayOrTensor, Floats, checked, is_double, is_tensor, namespace, promote, to_caller
+from ..arrays import ArrayOrTensor, Floats, checked, is_double, is_tensor, namespace, promote, to_caller, uncompiled
 from ..errors import InputError
 from ..geometry.grid import Grid
 from ..validation import instance, require_finite, shape_text, whole_shape
@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 AnyVolume = Volume | ArrayOrTensor
 
 
+@uncompiled
 def trace_rays(
     volume: Volume | ArrayOrTensor,
     sources: ArrayLike | ArrayOrTensor,
@@ -89,6 +90,7 @@ def trace_rays(
     return _as_input(integrals.reshape(n), array, sources, targets)
 
 
+@uncompiled
 def trace_fans(
     volume: Volume | ArrayOrTensor,
     vectors: ArrayLike | ArrayOrTensor,

@@ -24,3 +24,5 @@ are `warn_of_frames` of frame_checks.py. Pictures are laid out by mosaic.py and 
 
 FORMATS = (".h5", ".hdf5", ".npz", ".pt")
 """Endings of run files."""
+EXPORT_FORMATS = (*FORMATS, ".dcm")
+"""Endings of the files that a run is written to; .dcm holds its counts alone."""

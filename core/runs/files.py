@@ -22,7 +22,8 @@ from ..hdf5 import attributes, datasets, opened, pack, read_numbers
 from ..scanner_kinds import scanner_kind
 from ..volumes.formats import numpy_files
 from ..volumes.volume import Volume
-from . import FORMATS
+from . import EXPORT_FORMATS, FORMATS
+from .dicom_counts import write_counts
 from .run import ProjectionRun
 
 _FORMAT = "mphDRR run"
@@ -93,12 +94,18 @@ _Contents = tuple[dict[str, Array], dict[str, Any]]
 
 
 def write_run(run: ProjectionRun, path: AnyPath) -> None:
-    """Write a run as HDF5 (.h5, .hdf5), NumPy archive (.npz) or torch file (.pt), by the path's ending.
+    """Write a run as HDF5 (.h5, .hdf5), NumPy archive (.npz) or torch file (.pt), or its counts as DICOM (.dcm).
+
+    The path's ending chooses the format.
 
     Raises `InputError` for another ending, if torch is missing for .pt, or if the file cannot be written; an existing file
     then stays as it is.
     """
-    pack_file, _ = _FORMATS[require_ending(path, FORMATS)]
+    ending = require_ending(path, EXPORT_FORMATS)
+    if ending == ".dcm":
+        write_counts(run, path)
+        return
+    pack_file, _ = _FORMATS[ending]
     volume_attributes, scanner_attributes = {}, {}
     if run.volume is not None:
         volume_attributes = {"volume_quantity": run.volume.quantity, "volume_unit": run.volume.unit}

@@ -94,7 +94,7 @@ def _fill_by_axis(array: Floats32, index_from_index: Floats, method: str, result
 
 def _nearest_stencil(position: Floats, step: float, n: int) -> _Stencil:
     """Return the voxel that contains each position, with weight 1; 0 outside the grid."""
-    index = np.floor(position + 0.5).astype(np.int64)
+    index = np.floor(np.round(position, 6) + 0.5).astype(np.int64)  # of centres on faces, rounding chooses no side
     inside = (index >= 0) & (index < n)
     return index.clip(0, n - 1)[:, None], inside.astype(np.float32)[:, None]
 

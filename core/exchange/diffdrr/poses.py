@@ -8,6 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from ...arrays import require_numbers
 from ...errors import InputError
 from ...geometry.rotations import pose_matrix, rotation_matrix, rotation_parameters, se3_exp, se3_log
 from ...validation import real_array
@@ -100,10 +101,12 @@ def pose_matrices(
     if [*names] or len(numbers) != (1 if is_matrix else 2):
         raise InputError(f"expected a pose, or rotation, translation and parameterization; got {len(args)} arguments")
     if is_matrix:
-        return RigidTransform(numbers[0]).matrix.to(dtype)
+        require_numbers(matrix := RigidTransform(numbers[0]).matrix, "pose")
+        return matrix.to(dtype)
     tensors = []
     for value, name in zip(numbers, ("rotation", "translation"), strict=True):
         tensor = value if isinstance(value, Tensor) else torch.from_numpy(real_array(value, name, None))
+        require_numbers(tensor, name)
         tensors.append(torch.atleast_2d(tensor.to(dtype or torch.promote_types(tensor.dtype, torch.float32))))
     n = max(map(len, tensors))
     if any(len(x) not in (1, n) for x in tensors) or tensors[1].shape[1:] != (3,):

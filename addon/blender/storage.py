@@ -53,9 +53,8 @@ class _ChangedPath(NamedTuple):
 _changed_paths: list[_ChangedPath] = []  # paths changed by the save that is going on
 _saved_folder = Path()  # folder of the .blend, or the temporary one, before the save that is going on
 _saved_names: set[str] | None = None  # names of our files that the .blend as last saved needs; None: not known
-_left_folders: dict[
-    Path, set[str] | None
-] = {}  # folders that a Save As has left, with the `_saved_names` of their .blend
+_left_folders: dict[Path, set[str] | None] = {}
+"""Folders that a Save As has left, with the `_saved_names` of their .blend."""
 _save_note = (0.0, "")  # the time of the last save, s, and the line about it
 
 

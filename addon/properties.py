@@ -133,7 +133,7 @@ class ScannerProperties(bpy.types.PropertyGroup):
     keep_aimed: BoolProperty(
         name="Keep Aimed",
         description="Turn a module that is moved so that it keeps looking at the isocentre. One that is only turned "
-        "stays turned: it is tilted",
+        "stays turned: it is tilted. What an animation, a constraint or a deformed parent moves keeps its direction",
         default=True, update=on_edit("scanner"),
     )  # fmt: skip
     # The modules' properties have the first module's values here. `mixed` names those that differ between modules.

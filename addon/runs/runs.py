@@ -82,7 +82,7 @@ def add_run(
         unique, number = f"{name} {number}", number + 1
     item = settings.runs.add()
     item.name = item.usual_name = unique
-    item.file, item.summary = storage.stored_path(path.absolute()), run_summary(run)
+    item.file, item.summary = storage.stored_path(storage.adopt(path.absolute())), run_summary(run)
     item.state, item.scanner = json.dumps(state) if state else "", collection
     mark_shown(scene, len(settings.runs) - 1)
 

@@ -225,8 +225,9 @@ def read_scanner(collection: bpy.types.Collection) -> Scanner:
     that a script has just moved are refreshed first: Blender has not yet called the handlers. Raises InputError for no
     modules, equal module numbers and impossible values.
     """
-    following.refresh(collection)
     cameras_ = modules(collection)
+    objects.require_evaluated(cameras_)
+    following.refresh(collection)
     if not cameras_:
         raise InputError(f"collection '{collection.name}' has no modules: import a geometry first")
     by_number: dict[int, bpy.types.Object] = {}
@@ -293,10 +294,9 @@ def aim_modules(collection: bpy.types.Collection) -> list[int]:
     cameras_ = modules(collection)
     placement = read_placement(kind_of(collection), cameras_, objects.world_matrices(cameras_))
     turned = []
-    matrices = cameras.camera_matrices(placement.aims)
-    for camera, matrix, is_aimed in zip(cameras_, matrices, placement.aimed, strict=True):
+    for camera, pose, is_aimed in zip(cameras_, placement.aims, placement.aimed, strict=True):
         if not is_aimed:
-            objects.set_world_matrix(camera, matrix)
+            following.aim_camera(camera, pose)
             turned.append(camera.mphdrr_module.number)
     following.refresh(collection)
     return sorted(turned)

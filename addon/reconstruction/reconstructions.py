@@ -108,8 +108,7 @@ def _make_job(
     readers, panel_mu = _mu_readers(scene), scene.mphdrr_reconstruction.mu
     mu_name = panel_mu.name if panel_mu in volumes.volume_objects(scene) else None
     uid, start = scene.session_uid, time.perf_counter()
-    has_window = windows.has_window()
-    if has_window:
+    if has_window := windows.has_window():
         images.open_editor(context)
     live = _LiveResult(context, f"{name} {method.label}", previous)
 

@@ -188,8 +188,7 @@ def _rebuild(
         if camera.data.users == 1 and not cameras.is_set_to(camera.data, tuple(field)):
             cameras.set_field_of_view(camera.data, tuple(field))
         text = repr((size, construction))
-        items = [item for item in parts[camera] if _is_outdated(item.data, text)]
-        if items:
+        if items := [item for item in parts[camera] if _is_outdated(item.data, text)]:
             outdated.append((m, text, items))
     if outdated:
         _reshape(system, cameras_, outdated, scanner)

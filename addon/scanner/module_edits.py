@@ -236,8 +236,7 @@ def renumber(collection: bpy.types.Collection, order: Literal["RINGS", "LIST"] =
     They are listed, projected and exported in that order from now on. Names that the user gave stay. Raises InputError
     where the scanner is untidy, or its numbers are impossible; it stays as it was.
     """
-    untidy_items = untidy_text(collection)
-    if untidy_items:
+    if untidy_items := untidy_text(collection):
         raise InputError(f"scanner '{collection.name}': {untidy_items}: press Tidy Modules in the Design panel first")
     system, camera_objects = scanner.read_scanner(collection), scanner.modules(collection)
     new_order = np.arange(len(camera_objects))

@@ -212,8 +212,7 @@ def _aimed_poses(kind: ScannerType, poses: NDArray[np.float64]) -> tuple[NDArray
     A rolled module is not aimed. Kinds without aiming, and modules at the isocentre, are taken as aimed.
     """
     aims, aimed, is_away = poses.copy(), np.ones(len(poses), bool), np.any(poses[:, :3, 3], axis=1)
-    away_aims = kind.aimed(poses[is_away, :3, 3])
-    if away_aims is not None:
+    if (away_aims := kind.aimed(poses[is_away, :3, 3])) is not None:
         aims[is_away], aimed[is_away] = away_aims, np.abs(poses[is_away] - away_aims).max(axis=(1, 2)) <= _AIM_ERROR
     return aims, aimed
 

@@ -203,8 +203,7 @@ def active_scanner(scene: bpy.types.Scene) -> bpy.types.Collection | None:
 
 def required_scanner(scene: bpy.types.Scene) -> bpy.types.Collection:
     """Return the scanner that the panels work on; raise `InputError` where there is none."""
-    collection = active_scanner(scene)
-    if collection is None:
+    if (collection := active_scanner(scene)) is None:
         raise InputError("no scanner in the scene: import a workbook first")
     return collection
 
@@ -232,8 +231,7 @@ def read_scanner(collection: bpy.types.Collection) -> Scanner:
         raise InputError(f"collection '{collection.name}' has no modules: import a geometry first")
     by_number: dict[int, bpy.types.Object] = {}
     for camera in cameras_:
-        first = by_number.setdefault(camera.mphdrr_module.number, camera)
-        if first is not camera:
+        if (first := by_number.setdefault(camera.mphdrr_module.number, camera)) is not camera:
             number, advice = camera.mphdrr_module.number, "press Tidy Modules in the Design panel, or delete one"
             raise InputError(f"'{first.name}' and '{camera.name}' both have module number {number}: {advice}")
     is_added = any(camera.mphdrr_module.added for camera in cameras_)

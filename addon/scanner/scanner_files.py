@@ -39,8 +39,7 @@ def export_workbook_job(collection: bpy.types.Collection, path: Path, use_templa
         written_columns = workbook.write_system(system, path, template, columns).columns
         with recording.recorded_warnings():  # the writer has already warned of the template's doubts
             written = workbook.read_scanner(path, system.kind, written_columns)
-        difference = _difference(system, written)
-        if difference:
+        if difference := _difference(system, written):
             problem = f"was written, but reads back differently ({difference})"
             raise InputError(f"{path}: {problem}; the scene keeps its numbers")
         # The scene keeps its own float64 numbers, from which the workbook's may differ in the last digit.
@@ -48,8 +47,7 @@ def export_workbook_job(collection: bpy.types.Collection, path: Path, use_templa
 
     def finish(written: Scanner) -> str:
         """Store that the scene's scanner is that of the workbook, and return the line to report."""
-        collection = bpy.data.collections.get(name)
-        if collection is not None:
+        if (collection := bpy.data.collections.get(name)) is not None:
             scanner.store_saved_state(collection, written)
         return f"Wrote {len(written)} modules of {name!r} to {path}"
 

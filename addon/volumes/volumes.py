@@ -181,8 +181,7 @@ def state_text(item: bpy.types.Object) -> str:
 
 def file_note(item: bpy.types.Object) -> str:
     """Return the size of a Volume object's file in words, or "missing"."""
-    size = storage.file_size(file_of(item))
-    if size is None:
+    if (size := storage.file_size(file_of(item))) is None:
         return "missing"
     display_note = ", coarser copy shown" if ids.PREVIEW in item.data.filepath else ""
     storage_note = "" if bpy.data.filepath else ", until saved"

@@ -129,7 +129,7 @@ class MPHDRR_OT_remake_volumes(jobs.JobOperator, bpy.types.Operator):
 
     bl_label = "Make Missing Volumes Again"
 
-    poll = needs((lambda context: recovery.missing_volumes(context.scene)[0], "No phantom or map misses its voxels"))
+    poll = needs((lambda context: recovery.missing_volumes(context.scene)[0], "No phantom or map misses its file"))
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
         return recovery.remake_job(context.scene)

@@ -101,8 +101,7 @@ def _set_spect(scene: bpy.types.Scene) -> None:
 def _hide_startup(scene: bpy.types.Scene, collection: bpy.types.Collection) -> None:
     """Hide the objects of Blender's own startup file, and look through a module instead of its camera."""
     for name in _STARTUP:
-        item = scene.objects.get(name)
-        if item is not None:
+        if (item := scene.objects.get(name)) is not None:
             item.hide_viewport = item.hide_render = True
             if scene.camera == item:
                 scene.camera = scanner.modules(collection)[0]

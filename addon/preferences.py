@@ -64,8 +64,7 @@ class MPHDRR_Preferences(bpy.types.AddonPreferences):
         for item in keymap.keymap_items if keymap else ():
             if getattr(item.properties, "name", "") == PIE:
                 rna_keymap_ui.draw_kmi([], keyconfig, keymap, item, layout, 0)
-        folder = own_folder()
-        if folder is not None:
+        if (folder := own_folder()) is not None:
             row = layout.row()
             text = iface("Compiled code, {size} in {folder}")
             row.label(text=text.format(size=readable_size(cache_size()), folder=folder), translate=False)

@@ -150,8 +150,7 @@ def promote(*values: ArrayOrTensor) -> tuple[ArrayOrTensor, ...]:
 
     Tensors stay part of torch's graph.
     """
-    device = next((value.device for value in values if is_tensor(value)), None)
-    if device is None:
+    if (device := next((value.device for value in values if is_tensor(value)), None)) is None:
         return values
     import torch
 

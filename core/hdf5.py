@@ -98,8 +98,7 @@ def parse_seal(start: bytes) -> Seal | None:
 
     Raises `InputError` if the seal is damaged, or of a newer format.
     """
-    match = _TEXT.fullmatch(start)
-    if match is None:
+    if (match := _TEXT.fullmatch(start)) is None:
         if start.startswith(b"mphDRR "):
             raise InputError(f"changed: its first {HEADER} bytes are not as they were written")
         return None
@@ -132,8 +131,7 @@ def opened(path: AnyPath, offset: int = 0, *, whole: bool = False) -> Iterator[A
 
     path = require_file(path)
     with reading(path, "HDF5"), open(path, "rb") as file:
-        sealed = _sealed(file, offset)
-        if sealed is None:
+        if (sealed := _sealed(file, offset)) is None:
             if offset:
                 raise InputError(f"damaged: nothing of mphDRR begins at its byte {offset}")
             _probe(path)
@@ -176,8 +174,7 @@ class _Sealed(io.RawIOBase):
 
     def __init__(self, file: BinaryIO, seal: Seal, offset: int) -> None:
         self._file, self._seal, self._start, self._position = file, seal, offset + HEADER, 0
-        size = file.seek(0, os.SEEK_END) - offset
-        if size < seal.file_size:
+        if (size := file.seek(0, os.SEEK_END) - offset) < seal.file_size:
             raise InputError(f"cut: {size} of {seal.file_size} bytes")
         file.seek(self._start)
         if seal.version == 1:  # without a table of its own: one is made of the content, which is checked as a whole

@@ -71,8 +71,7 @@ def _draw_all(layout: bpy.types.UILayout, collection: bpy.types.Collection) -> N
     if not pinholes.has_pinholes(kind):
         layout.prop(properties, "bore", text="Bore (mm)")
     if properties.findings:
-        findings = json.loads(properties.findings)
-        if not findings:
+        if not (findings := json.loads(properties.findings)):
             layout.label(text="Nothing found", icon="CHECKMARK")
         for text in findings[:_MAX_FINDINGS]:
             draw_text(layout, text)

@@ -22,8 +22,7 @@ class _EpipolarPanel:
         row = layouts.invoking(layout.row(align=True))
         row.operator("mphdrr.pick_pixel", icon="EYEDROPPER")
         row.operator("mphdrr.clear_pixel", text="", icon="X")
-        run = epipolar.run_views(context.scene)
-        if run is None or settings.views != run.name:
+        if (run := epipolar.run_views(context.scene)) is None or settings.views != run.name:
             return
         layout.prop(settings, "module")
         row = layout.row(align=True)

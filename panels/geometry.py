@@ -118,8 +118,7 @@ class MPHDRR_PT_modules(ScannerPanel, bpy.types.Panel):
             "MPHDRR_UL_modules", "", collection, "all_objects", state, "active_index", rows=5, maxrows=5
         )
 
-        camera = selection.listed_module(context.scene)
-        if camera is not None:
+        if (camera := selection.listed_module(context.scene)) is not None:
             text = iface("Look Through {module}").format(module=camera.name)
             look = layout.operator("mphdrr.look_through_module", text=text, icon="OUTLINER_OB_CAMERA")
             look.number = camera.mphdrr_module.number

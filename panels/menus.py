@@ -104,8 +104,7 @@ def draw_module(layout: bpy.types.UILayout, camera: bpy.types.Object | None) -> 
 
 def draw_in_context_menu(menu: bpy.types.Menu, context: bpy.types.Context) -> None:
     """Draw the active module's commands in Blender's context menu of an object."""
-    camera = selection.module_of(context.object)
-    if camera is not None:
+    if (camera := selection.module_of(context.object)) is not None:
         menu.layout.separator()
         draw_module(invoking(menu.layout), camera)
 

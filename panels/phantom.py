@@ -27,8 +27,7 @@ class MPHDRR_PT_phantom(Folded, bpy.types.Panel):
         row.operator("mphdrr.import_volume", text="Import Volume", icon="IMPORT")
         if storage.missing_volumes():
             _draw_missing(top.column(align=True), context.scene)
-        item = volumes.panel_volume(context)
-        if item is not None:
+        if (item := volumes.panel_volume(context)) is not None:
             _draw_numbers(layout, item)
             row = layout.split(factor=0.32, align=True)
             row.popover("MPHDRR_PT_phantom_settings")

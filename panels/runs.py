@@ -71,8 +71,7 @@ class MPHDRR_PT_runs_of_images(_RunsPanel, ImagesSidebar, bpy.types.Panel):
 
 def draw_changes(layout: bpy.types.UILayout, scene: bpy.types.Scene) -> None:
     """Draw the changes since the shown run was rendered, if any, and a button that renders again."""
-    lines = runs.change_lines(scene)
-    if not lines:
+    if not (lines := runs.change_lines(scene)):
         return
     box = layout.box()
     box.alert = lines != [runs.UNKNOWN]

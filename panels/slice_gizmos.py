@@ -35,8 +35,7 @@ class MPHDRR_GGT_slices(bpy.types.GizmoGroup):
 
             def set(value: float, axis: int = axis) -> None:
                 """Move the slice of the axis to the handle's position."""
-                item = slices.active_sliced_volume(bpy.context)
-                if item is not None:
+                if (item := slices.active_sliced_volume(bpy.context)) is not None:
                     slices.move_slice(item, axis, value / slices.slice_track(item, axis)[1].length)
 
             arrow.target_set_handler("offset", get=get, set=set)

@@ -86,8 +86,7 @@ def _run(arguments: argparse.Namespace) -> None:
     paths = [output_path(name, kind.suffixes) for name in arguments.output]
     style = Rendering(*(not arguments.no_labels, *(getattr(arguments, name) for name in Rendering._fields[1:])))
     page = kind.page(arguments.size, style)
-    blends = [file for file in arguments.files if file.lower().endswith(".blend")]
-    if blends:
+    if blends := [file for file in arguments.files if file.lower().endswith(".blend")]:
         if len(arguments.files) > 1:
             raise mph.InputError(f"{blends[0]}: a .blend holds all that is shown; give no other file")
         refuse(arguments, _POSED, "is for phantoms that are named on the command line, not for a .blend")

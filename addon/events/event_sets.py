@@ -162,8 +162,7 @@ def open_event_job(context: bpy.types.Context, folder: str, number: int, model: 
         stages("writing the voxels")
         truth = stored_volumes.store_volume(event.truth, files, event.placement, {"event": number, "set": str(path)})
         phantom = None if planned.entry.kind is None else _store_phantom(planned, target, files, progress)
-        models = planned.recipe.models
-        if not models:
+        if not (models := planned.recipe.models):
             return _StoredEvent(name, _describe(planned), truth, phantom, None, None)
         run = event.run(model or next(iter(models)))
         run = replace(run, settings={**run.settings, "volume": name})
@@ -185,8 +184,7 @@ def open_event_job(context: bpy.types.Context, folder: str, number: int, model: 
         if stored_event.phantom is not None:
             settings.phantom = _place_phantom(scene, stored_event.phantom, target)
             yield None
-        item = jobs.find_by_uid(bpy.data.objects, truth_uid)
-        if item is None:
+        if (item := jobs.find_by_uid(bpy.data.objects, truth_uid)) is None:
             item = volumes.add_stored(stored_event.truth, stored_event.name, scene.collection)
         else:
             volumes.replace_stored(item, stored_event.truth)
@@ -220,8 +218,7 @@ def _recipe_reader(filepath: str, folder: str) -> Callable[[], events.EventRecip
 def _read_event(path: Path, number: int) -> events.Event:
     """Return an event of a set; raise `InputError` where the set lacks it."""
     event_set = events.EventSet(path)
-    event = next((event for event in event_set if event.number == number), None)
-    if event is None:
+    if (event := next((event for event in event_set if event.number == number), None)) is None:
         numbers = event_set.numbers
         content = f"{_events_text(len(numbers))}, {numbers[0]} to {numbers[-1]}" if len(numbers) else "no events"
         raise InputError(f"event {number}: not in {path}, which holds {content}")
@@ -259,8 +256,7 @@ def _scaled(value: Any, factor: float) -> Any:
 
 def _place_phantom(scene: bpy.types.Scene, phantom: _Phantom, target: _Target) -> bpy.types.Object:
     """Give the scene's phantom an event's settings, voxels and pose, and return its object; add a new one if it is gone."""
-    item = jobs.find_by_uid(bpy.data.objects, target.uid)
-    if item is None:
+    if (item := jobs.find_by_uid(bpy.data.objects, target.uid)) is None:
         item = volumes.add_stored(phantom.stored[0], "Event Phantom", scene.collection)
     if phantom.settings is None:
         volumes.replace_stored(item, phantom.stored[0])

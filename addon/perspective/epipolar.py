@@ -91,8 +91,7 @@ def run_views(scene: bpy.types.Scene) -> RunViews | None:
     mosaic_uid = mosaic.session_uid
     if mosaic_uid not in _runs:
         _runs.clear()
-        stored_views = images.mosaic_views(mosaic)
-        if stored_views is None:
+        if (stored_views := images.mosaic_views(mosaic)) is None:
             return None
         views, roi_radius = stored_views
         arrays = (views.sources, views.detector_centers, views.u_steps, views.v_steps)
@@ -103,8 +102,7 @@ def run_views(scene: bpy.types.Scene) -> RunViews | None:
 
 def required_views(scene: bpy.types.Scene) -> RunViews:
     """Return the views of the shown run; raise `InputError` where there are none."""
-    run = run_views(scene)
-    if run is not None:
+    if (run := run_views(scene)) is not None:
         return run
     if not images.belong_to(scene):
         raise InputError("the projections are of another scene: render this one's first")

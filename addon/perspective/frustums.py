@@ -231,8 +231,7 @@ def _read_request(context: bpy.types.Context) -> _Request:
 
 def _module_views(scene: bpy.types.Scene, camera: bpy.types.Object) -> Views:
     """Return the view of one module, with the pixels of the Projections panel."""
-    collection = scanner.scanner_of(scene, camera)
-    if collection is None:
+    if (collection := scanner.scanner_of(scene, camera)) is None:
         raise InputError(f"{camera.name!r} is in no scanner of the scene")
     return recipe_views(runs.panel_recipe(scene), scanner.read_module(collection, camera))
 

@@ -180,8 +180,7 @@ def update_phantom_job(item: bpy.types.Object, bake: bool = False) -> jobs.Job:
 
 def make_voxelizer(item: bpy.types.Object, bake: bool = False) -> Callable[[Progress | None], list[StoredVolume]]:
     """Return the work of `update_phantom_job` as a function that leaves bpy alone; its result is for `replace_voxels`."""
-    settings = settings_of(item)
-    if settings is None:
+    if (settings := settings_of(item)) is None:
         raise InputError("no phantom is active: select one that was added with its settings")
     phantom_job, folder, items = copy_settings(settings), storage.folder(), with_children(item)
     quantities = [settings.quantity, *(volumes.quantity_of(child) for child in items[1:])]
@@ -271,8 +270,7 @@ def outline_of(item: bpy.types.Object) -> bpy.types.Object | None:
 
 def remove_outline(item: bpy.types.Object) -> None:
     """Remove a phantom's outline, if it has one."""
-    outline = outline_of(item)
-    if outline is not None:
+    if (outline := outline_of(item)) is not None:
         objects.remove_objects([outline])
 
 

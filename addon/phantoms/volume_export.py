@@ -30,8 +30,7 @@ def export_job(item: bpy.types.Object, path: Path, template: str = "", tags: str
         raise InputError(f"{path}: is the scene's own file of {item.name!r}; choose another name")
     phantoms.require_current(item)
     provenance: dict[str, Any] = {"object": item.name}
-    phantom = phantoms.settings_of(item)
-    if phantom is not None:
+    if (phantom := phantoms.settings_of(item)) is not None:
         provenance |= phantom.recipe()
     if item.data.is_sequence:
         provenance |= {"frame": bpy.context.scene.frame_current, "state": volumes.state_text(item)}

@@ -119,8 +119,7 @@ def recolor_images(display: Display, cached_projections: dict[int, NDArray[np.fl
     _store_tiles(_load_pixels(mosaic), layout, numbers, rings, unit, None)
     pngs = yield from _run_in_worker(lambda progress: _color(projections, display, progress), True)
     for image_name, png in zip(image_names, pngs, strict=True):
-        picture = bpy.data.images.get(ids.picture_name(image_name))
-        if picture is not None:
+        if (picture := bpy.data.images.get(ids.picture_name(image_name))) is not None:
             _load_pixels(fill(picture, png))
             yield True
     _store_tiles(bpy.data.images[ids.MOSAIC], layout, numbers, rings, unit, display)

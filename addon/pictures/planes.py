@@ -42,8 +42,7 @@ def show(scene: bpy.types.Scene, run: ProjectionRun, collection: bpy.types.Colle
             continue
         camera = cameras[number]
         picture = bpy.data.images[ids.picture_name(images.projection_name(number, numbers))]
-        plane = old.pop(camera, None)
-        if plane is None:
+        if (plane := old.pop(camera, None)) is None:
             plane = objects.picture_empty(ids.part_name(camera.name, "projection"), camera, picture, "BACK")
             plane.lock_scale = (True, True, True)
             plane.mphdrr_module.part, plane.mphdrr_module.number = "PLANE", number

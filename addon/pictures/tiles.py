@@ -166,8 +166,7 @@ def draw() -> None:
     """Draw the frame around the active module's image; Blender calls this for every Image Editor."""
     context = bpy.context
     image = context.space_data.image
-    index = active_tile(context, image)
-    if index is None:
+    if (index := active_tile(context, image)) is None:
         return
     left, bottom, right, top = frame(context, shown_pictures(image)[index], image.size)
     corners = [(left, top, 0), (right, top, 0), (right, bottom, 0), (left, bottom, 0), (left, top, 0)]

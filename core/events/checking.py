@@ -106,8 +106,7 @@ def check(folder: AnyPath, progress: Progress | None = None) -> list[Fault]:
     def find_fault(number: int) -> Fault | None:
         """Return the fault of an event; "foreign" for a faulty file of an event that nobody requested."""
         location = locations.get(number, FileLocation(str(target.store.event_path(number))))
-        fault = _event_fault(location, number, fingerprint)
-        if fault is None or number in requested:
+        if (fault := _event_fault(location, number, fingerprint)) is None or number in requested:
             return fault
         return Fault("foreign", fault.path, f"{fault.text}, and not in the index")
 

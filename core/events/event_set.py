@@ -238,8 +238,7 @@ class Event:
             raise InputError(f"{model!r}: no such model; there are {', '.join(models) or 'none'}")
         settings: dict[str, Any] = {"model": model, "event": self.number, "volume": self.name}
         recipe = models[model] if level == 1.0 else _at_level(models[model], positive(level, "level"))
-        record = self._run_recipe(recipe)
-        if record is not None:
+        if (record := self._run_recipe(recipe)) is not None:
             settings["recipe"] = record.tables()
         image_model: Any = recipe_model(self._folder.recipe.placed(recipe), self.system)
         images = self.images(model, noise_seed, level)

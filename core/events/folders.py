@@ -128,8 +128,7 @@ class SetFolder:
         """Return the events of `numbers` whose files are missing or incomplete; `InputError` for one of another recipe."""
         missing, has_warned = [], False
         for number in numbers:
-            header = self.valid_header(number, locations.get(number))
-            if header is None:
+            if (header := self.valid_header(number, locations.get(number))) is None:
                 missing.append(number)
                 continue
             if header.recipe != self.recipe.fingerprint:

@@ -104,8 +104,7 @@ def _start(folder: Path, threads: int) -> None:
 
 def _exit_with_parent() -> None:
     """Exit this process when its parent is killed; it would wait for work forever otherwise."""
-    parent = parent_process()
-    if parent is not None:
+    if (parent := parent_process()) is not None:
         parent.join()
         os._exit(1)
 

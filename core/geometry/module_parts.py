@@ -100,6 +100,5 @@ def surface_fault(solid: Solid) -> str | None:
 
 def check_watertight(solid: Solid) -> None:
     """Raise `InputError` unless a collimator's surface is closed, consistently oriented and not inside out."""
-    fault = surface_fault(solid)
-    if fault:
+    if fault := surface_fault(solid):
         raise InputError(f"collimator mesh: it {fault}")

@@ -86,8 +86,7 @@ def _fit_ring(system: PinholeSystem, modules: Indexes) -> RingFit:
     """Fit an ellipse to the ring of the `modules`, indices (M,) in any order."""
     azimuths, modules = _sort_ring(system, modules, _is_clockwise(system, [modules]))
     points, z = system.centers[modules, :2], system.centers[modules, 2]
-    ellipse = fit_ellipse(points)
-    if ellipse is None:
+    if (ellipse := fit_ellipse(points)) is None:
         radius = float(np.linalg.norm(points, axis=1).mean())
         ellipse = Ellipse(np.full(2, radius), np.zeros(2), 0.0)
     deviations: dict[Spacing, float] = {}

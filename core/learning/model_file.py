@@ -271,8 +271,7 @@ class TrainedNetwork:
         for name in allow:
             one_of(name, ALLOWED, "allow")
         differing = self.contents.differing(setup)
-        refused = [name for name in differing if name not in allow]
-        if refused:
+        if refused := [name for name in differing if name not in allow]:
             names = " and ".join(refused)
             raise InputError(f"{self.path}: trained for another {names}; --allow {' '.join(refused)} takes it anyway")
         return [f"{self.path.name} was trained for another {name}, which was allowed" for name in differing]

@@ -144,8 +144,7 @@ def _fit(
     origin = point  # steps relative to it are small and lose no digits
     offsets = matrices[:, :, :3] @ origin + matrices[:, :, 3]
     shift = np.zeros(3)
-    state = _residuals(matrices, offsets, shift, pixels, whitening)
-    if state is None:
+    if (state := _residuals(matrices, offsets, shift, pixels, whitening)) is None:
         position = f"behind the source of image {offsets[:, 2].argmin() + 1} of {len(index)}"
         expected = "the images of one point in front of all sources, as (column, row)"
         raise InputError(f"triangulation: the rays meet {position}; expected {expected}")

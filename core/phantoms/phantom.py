@@ -200,8 +200,7 @@ class ShapePhantom(Phantom):
     def __post_init__(self) -> None:
         if isinstance(self.shapes, Shape) or not isinstance(self.shapes, Iterable):
             raise InputError(f"phantom: expected a list of shapes, got {type(self.shapes).__name__}")
-        shapes = tuple(self.shapes)
-        if not shapes:
+        if not (shapes := tuple(self.shapes)):
             raise InputError("phantom: expected one shape or more, got none")
         for i, shape in enumerate(shapes, 1):
             if not isinstance(shape, Shape):

@@ -83,8 +83,7 @@ class Shape:
         if self.mode not in MODES:
             raise InputError(f"mode: expected one of {', '.join(MODES)}, got {self.mode!r}")
         for quantity, unit in (("activity", "kBq/mL"), ("mu", "1/mm")):
-            value = getattr(self, quantity)
-            if value is None:
+            if (value := getattr(self, quantity)) is None:
                 continue
             value = float(real_array(value, quantity, ()))
             if value < 0 and self.mode == "paint":

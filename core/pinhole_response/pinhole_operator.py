@@ -195,8 +195,7 @@ class PinholeOperator(PinholeViews):
     def _box_responses(self, m: int, origin: Index, shape: Index, dtype: type) -> list[BoxResponse]:
         """Return view m's responses to a box of the volume, one for each zone that it reaches into, with their pixels."""
         key = m, origin, shape, dtype
-        responses = self._boxes.get(key)
-        if responses is None:
+        if (responses := self._boxes.get(key)) is None:
             zones = self._reached_zones(m, origin, shape)
             responses = [self._response(m, *zone, dtype).restrict_to_box(origin, shape) for zone in zones]
             if len(self._boxes) >= _BOXES_PER_VIEW * len(self.views):

@@ -313,8 +313,7 @@ class Projector(LinearOperator):
         self._require_rays()
         execution = self._execution(x)
         for m, image in enumerate(self._plain_images(execution, x, mu)):
-            response = self.model.response(self.views, m)
-            if response is not None:
+            if (response := self.model.response(self.views, m)) is not None:
                 along_v, along_u = (cast_like(matrix, image) for matrix in response)
                 image = along_v @ image @ along_u.T
             if self._efficiency is not None:  # the projectors of close voxels have their own
@@ -363,8 +362,7 @@ class Projector(LinearOperator):
         if self._efficiency is not None:
             images = images * cast_like(self._efficiency, images)
         for m in range(len(self.views)):
-            response = self.model.response(self.views, m)
-            if response is None:
+            if (response := self.model.response(self.views, m)) is None:
                 return images
             if m == 0:
                 images = images + 0  # a copy: the caller's images stay as they are
@@ -450,8 +448,7 @@ def _warnings(grid: Grid, views: Views, model: Model) -> Iterator[str]:
     """Yield the warnings about a projector's arguments that look wrong, each with its number."""
     if caution := model.caution(views, grid):
         yield caution
-    width = float(np.ptp(grid.corners(), axis=0).max())
-    if width < _NARROW and max(grid.shape) > 3:
+    if (width := float(np.ptp(grid.corners(), axis=0).max())) < _NARROW and max(grid.shape) > 3:
         distance = float(np.linalg.norm(views.sources - grid.center, axis=1).min())
         yield f"the grid is {width:.3g} mm wide, {distance:.3g} mm from the sources: lengths are in mm; is it in metres?"
     yield from model.coefficient_warnings()

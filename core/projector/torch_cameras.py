@@ -254,8 +254,7 @@ def emission_images(
     # Depth of the plane through the grid's farthest corner, in units of the distance from pinhole to crystal.
     corners = positions.new_tensor(volume_grid.corners()) - positions.detach()[..., None, :]
     depth = ((corners @ rotations.detach()[..., 2:])[..., 0].amax(dim=-1) / l.detach()).clamp(min=1.0)
-    n = require_points(pixel_points, "emission images: pixel_points")
-    if n is None:
+    if (n := require_points(pixel_points, "emission images: pixel_points")) is None:
         views = camera_views(positions, rotations, l, pitch, offset, (n_v, n_u))
         edges = [shadow_edges(views, m, volume_grid) for m in range(len(views))]
         error = positive(tolerance, "tolerance")

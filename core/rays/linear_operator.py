@@ -79,8 +79,7 @@ class LinearOperator(ABC):
 
     def _run(self, x: ArrayOrTensor, progress: Progress | None = None, mu: ArrayOrTensor = None) -> ArrayOrTensor:
         """Apply to a checked array or tensor, one by one to those of a batch, without recording a graph."""
-        batch = tuple(x.shape[: x.ndim - len(self.shape_in)])
-        if not batch:
+        if not (batch := tuple(x.shape[: x.ndim - len(self.shape_in)])):
             return self._run_one(x, progress, mu)
         n = math.prod(batch)
         work = f"a batch of {n} times {shape_text(self.shape_out)} numbers"

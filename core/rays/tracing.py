@@ -273,8 +273,7 @@ def fan_gradient(execution: Execution, bundles: Bundles, volume: Floats, mu: Flo
 
 def _as_input(integrals: ArrayOrTensor, volume: Any, *geometry: Any) -> ArrayOrTensor:
     """Return `integrals` in the type of the geometry's tensors, or else of the volume's, on the first tensor's device."""
-    tensors = [x for x in (volume, *geometry) if is_tensor(x)]
-    if not tensors:
+    if not (tensors := [x for x in (volume, *geometry) if is_tensor(x)]):
         return integrals
     import torch
 

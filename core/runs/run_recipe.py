@@ -444,8 +444,7 @@ def phantom_pose(recipe: Recipe) -> Floats:
 def with_phantom(recipe: Recipe, phantom: Phantom, pose: Floats) -> Recipe:
     """Return the recipe with a full description of the phantom: kind, numbers, and the pose as matrix and angles."""
     values: dict[str, Any] = {"matrix": pose.tolist(), "voxels": recipe["phantom.voxels"]}
-    angles = euler_degrees(pose)
-    if angles is not None:
+    if (angles := euler_degrees(pose)) is not None:
         values |= {"position": pose[:3, 3].tolist(), "euler_degrees": angles}
     cls: Any = type(phantom)
     for kind in KINDS:

@@ -40,8 +40,7 @@ class Calculation:
         """Return the settled value of the formula at `address`."""
         pending, begun = [address], set()
         while pending:
-            current = pending[-1]
-            if current in self._values:
+            if (current := pending[-1]) in self._values:
                 pending.pop()
                 continue
             begun.add(current)
@@ -214,8 +213,7 @@ def _areas_read_by(workbook: WorkbookXml, address: Address, formula: str, depth:
         return None
     areas: list[Reference] = []
     for text in references_and_names(formula):
-        area = parse_reference(text)
-        if area is None:
+        if (area := parse_reference(text)) is None:
             if _OTHER_FILE.match(text):
                 continue  # the cells of another file do not change with this one's
             table = workbook.tables.get(text.partition("[")[0].casefold())

@@ -184,8 +184,7 @@ def _find_table_faults(table: MappedTable, i: int, definitions: ColumnTable) -> 
     if not table.columns:
         yield f"{_key(i)} has no columns"
     for c in table.columns:
-        definition = definitions.get(c.quantity)
-        if definition is None:
+        if (definition := definitions.get(c.quantity)) is None:
             yield f"{_key(i, c.quantity)}: no such quantity, expected {', '.join(definitions)}"
         elif c.unit not in definition.units:
             yield f"{_key(i, c.quantity)}: unit {c.unit!r}, expected {', '.join(filter(None, definition.units)) or 'none'}"

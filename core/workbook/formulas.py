@@ -114,8 +114,7 @@ def _to_scalar(value: Any) -> Any:
 
 def _to_number(value: Any) -> float:
     """Return a value as a number: 0 for a blank cell; texts are not converted."""
-    value = _to_scalar(value)
-    if value is None:
+    if (value := _to_scalar(value)) is None:
         return 0.0
     if isinstance(value, (int, float)):
         return float(value)
@@ -449,10 +448,8 @@ class FormulaParser:
 
     def read_area(self, text: str) -> Any:
         """Return the values of the cells that a reference names, or the value behind a defined name."""
-        area = parse_reference(text)
-        if area is None:
-            formula = self.context.name(text)
-            if formula is None:
+        if (area := parse_reference(text)) is None:
+            if (formula := self.context.name(text)) is None:
                 raise NotComputable(f"it uses {text}")
             return FormulaParser(formula, self.context).value()
         sheet, top, left, bottom, right = area

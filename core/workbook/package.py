@@ -57,8 +57,7 @@ class Package:
 
     def read(self, name: str) -> bytes:
         """Return the unpacked bytes of a member; raise `InputError` if it is missing, too large or damaged."""
-        info = self._members.get(name.casefold())
-        if info is None:
+        if (info := self._members.get(name.casefold())) is None:
             raise InputError(f"{self.name}: not a whole .xlsx workbook (it has no {name})")
         if info.file_size > MAX_PART_BYTES:
             size, limit = readable_size(info.file_size), readable_size(MAX_PART_BYTES)

@@ -38,8 +38,7 @@ def _run(arguments: argparse.Namespace) -> None:
     path = None if arguments.output is None else output_path(arguments.output, SUFFIXES)
     if path is None and arguments.model is not None:
         raise InputError("--model says what is drawn: give -o FILE, too")
-    event_set = events.EventSet(arguments.folder)
-    if not event_set:
+    if not (event_set := events.EventSet(arguments.folder)):
         raise InputError(f"{arguments.folder}: it holds no events yet; mphdrr events make makes them")
     chosen = _choose_events(event_set, arguments.events, None if path is None else _EVENTS_PER_SHEET)
     rows = [event.row for event in chosen]

@@ -96,8 +96,7 @@ def _change_system(system: Scanner, arguments: argparse.Namespace) -> Scanner:
     chosen = np.isin(system.numbers, chosen_modules(system, arguments.modules).numbers)
     changes: dict[str, Any] = {}
     for name, columns in _settable_columns().items():
-        values = getattr(arguments, name)
-        if values is not None:
+        if (values := getattr(arguments, name)) is not None:
             if name not in system.columns.fields:
                 raise mph.InputError(f"--{_option_name(name)}: is no column of a {system.kind} scanner")
             value = np.multiply(values, ANGLE_UNITS["deg"]) if columns[0].kind == "angle" else values

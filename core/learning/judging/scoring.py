@@ -148,8 +148,7 @@ def _score_rods(volume: Volume, case: Case) -> Scores:
 def _score_pair(volume: Volume, case: Case) -> Scores:
     """Return the contrast at the altered place, and whether there is a rod."""
     phantom = _phantom(case, DerenzoPhantom)
-    site = phantom.altered_site()
-    if site is None:
+    if (site := phantom.altered_site()) is None:
         return {}
     (contrast,) = case.contrasts(volume, phantom, [site])
     return {"site": float(contrast), "site_has_rod": phantom.altered < 0}

@@ -191,8 +191,7 @@ def derenzo_score(
     instance(phantom, Phantom, "derenzo_score")
     require_quantity(volume.quantity, QUANTITIES, "derenzo_score")
     world_from_phantom = np.eye(4) if pose is None else checked_affine(pose, "phantom pose")
-    shapes = [shape for shape in phantom.shapes if isinstance(shape, DerenzoRods)]
-    if not shapes:
+    if not (shapes := [shape for shape in phantom.shapes if isinstance(shape, DerenzoRods)]):
         raise InputError(f"derenzo_score: expected a phantom with Derenzo rods, got a {phantom.title} without")
     all_sectors = [(rods, sector) for rods in shapes for sector in range(rods.sectors)]
     scores = []

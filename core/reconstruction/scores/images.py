@@ -43,8 +43,7 @@ def nrmse(volume: Values, truth: Values, mask: ArrayLike | None = None) -> float
         Grids, shapes or quantities differ, or the truth is 0 everywhere.
     """
     values, true = _pair(volume, truth, "nrmse", mask)
-    norm = float(np.sqrt(np.mean(true**2)))
-    if not norm:
+    if not (norm := float(np.sqrt(np.mean(true**2)))):
         raise InputError("nrmse: the truth is 0 everywhere: there is nothing to normalise by")
     return float(np.sqrt(np.mean((values - true) ** 2))) / norm
 
@@ -129,8 +128,7 @@ def contrast_to_noise(volume: Values, target: ArrayLike, background: ArrayLike) 
         for mask, name, smallest in ((target, "target", 1), (background, "background", 2))
     )
     contrast = float(target_values.mean() - background_values.mean())
-    noise = float(background_values.std(ddof=1))
-    if not noise:
+    if not (noise := float(background_values.std(ddof=1))):
         return float(np.copysign(np.inf, contrast)) if contrast else 0.0
     return contrast / noise
 
@@ -226,8 +224,7 @@ def _span(true: Floats, data_range: Any, name: str) -> float:
     """Return `data_range`, or by default largest minus smallest value of the truth; raise `InputError` if that is 0."""
     if data_range is not None:
         return positive(data_range, f"{name}: data_range")
-    span = float(true.max() - true.min())
-    if not span:
+    if not (span := float(true.max() - true.min())):
         raise InputError(f"{name}: the truth is the same everywhere; set data_range to the range of values")
     return span
 

@@ -100,6 +100,5 @@ class ProjectionRun:
 
         (x_u, x_v, x_k) is a point in the module's frame, mm from the pinhole.
         """
-        rotations = self.system.poses()[:, :3, :3]
-        matrices = self.views.projection_matrices()[:, :, :3] @ rotations
+        matrices = self.views.projection_matrices()[:, :, :3] @ self.system.poses()[:, :3, :3]
         return matrices / matrices[:, 2:, 2:]

@@ -12,6 +12,7 @@ from mathutils import Matrix
 from numpy.typing import NDArray
 
 from ...core import InputError, ProjectionRun, events, memory
+from ...core.cli.options import count_text
 from ...core.events.folders import SetFolder
 from ...core.events.templates import template_text
 from ...core.example import EXAMPLE
@@ -120,11 +121,11 @@ def make_set_job(filepath: str, folder: str, count: int) -> jobs.Job:
         if not new_events:
             return f"All events asked for are there already: {n_events} in {path}"
         size = memory.readable_size(sum(event.size for event in new_events))
-        return f"Made {_events_text(len(new_events))}, {size} in {seconds:.1f} s: {n_events} in {path}"
+        return f"Made {count_text(len(new_events), 'event')}, {size} in {seconds:.1f} s: {n_events} in {path}"
 
     def leftovers() -> str:
         """Return the line for a cancelled job: the number of events that were made and stay."""
-        return f"{_events_text(len(new_events))} made now and kept; Make Event Set goes on from there"
+        return f"{count_text(len(new_events), 'event')} made now and kept; Make Event Set goes on from there"
 
     return jobs.Job("Making an event set", work, finish, leftovers=leftovers)
 
@@ -220,7 +221,7 @@ def _read_event(path: Path, number: int) -> events.Event:
     event_set = events.EventSet(path)
     if (event := next((event for event in event_set if event.number == number), None)) is None:
         numbers = event_set.numbers
-        content = f"{_events_text(len(numbers))}, {numbers[0]} to {numbers[-1]}" if len(numbers) else "no events"
+        content = f"{count_text(len(numbers), 'event')}, {numbers[0]} to {numbers[-1]}" if len(numbers) else "no events"
         raise InputError(f"event {number}: not in {path}, which holds {content}")
     return event
 
@@ -315,8 +316,3 @@ def _describe(planned: events.PlannedEvent) -> str:
     for name, factor in (("size", planned.size), ("activity", planned.activity_factor)):
         words += [f"{name} × {factor:.3g}"] if factor != 1.0 else []
     return ", ".join(words)
-
-
-def _events_text(count: int) -> str:
-    """Return a number of events in words."""
-    return f"{count} event{'s' * (count != 1)}"

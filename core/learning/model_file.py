@@ -142,6 +142,9 @@ class TrainedNetwork:
     path: Path
     sha256: str
     contents: ModelContents
+    _last_setup: list[ScannerSetup] = field(
+        default_factory=list, init=False, repr=False
+    )  # of the last scan, at most one
 
     def __call__(self, run: ProjectionRun, allow: Sequence[str] = ()) -> Volume:
         """Reconstruct a run by the same scanner and physics, on the network's grid.
@@ -220,11 +223,6 @@ class TrainedNetwork:
         if len(_SETUPS) > _MAX_SETUPS:
             del _SETUPS[next(iter(_SETUPS))]
         return _SETUPS[key]
-
-    @cached_property
-    def _last_setup(self) -> list[ScannerSetup]:
-        """Setup of the last scan, in a list of one."""
-        return []
 
     def reconstruct(
         self,

@@ -174,8 +174,7 @@ class _Sealed(io.RawIOBase):
 
     def __init__(self, file: BinaryIO, seal: Seal, offset: int) -> None:
         self._file, self._seal, self._start, self._position = file, seal, offset + HEADER, 0
-        size = file.seek(0, os.SEEK_END) - offset
-        if size < seal.file_size:
+        if (size := file.seek(0, os.SEEK_END) - offset) < seal.file_size:
             raise InputError(f"cut: {size} of {seal.file_size} bytes")
         file.seek(self._start)
         if seal.version == 1:  # without a table of its own: one is made of the content, which is checked as a whole

@@ -92,8 +92,7 @@ def _draw_pinholes(layout: bpy.types.UILayout, column: bpy.types.UILayout, prope
     column.separator()
     column.prop(properties, "plate_thickness", text="Plate (mm)")
     column.prop(properties, "wall_thickness", text="Wall (mm)")
-    column.prop(properties, "opening_angle")
-    column.prop(properties, "edge_at")
+    layouts.draw_all(column, properties, "opening_angle", "edge_at")
     column.prop(properties, "intrinsic_fwhm", text="Crystal FWHM")
     draw_facts(
         layout.box().split(factor=0.42),

@@ -23,8 +23,7 @@ class MPHDRR_PT_event_set(Folded, bpy.types.Panel):
         if recipe_note is not None:
             _draw_note(layout, recipe_note)
         layout.prop(settings, "folder")
-        note = recipe_note or set_note
-        if note is not None and not note.is_wrong:
+        if (note := recipe_note or set_note) is not None and not note.is_wrong:
             column = layout.column(align=True)
             _draw_number(column, settings, "number", "mphdrr.try_event", "Another One")
             _draw_number(column, settings, "count", "mphdrr.make_event_set", "Make Event Set")

@@ -102,8 +102,7 @@ class MPHDRR_PT_modules(ScannerPanel, bpy.types.Panel):
         state = context.scene.mphdrr_geometry
         column = layout.column(align=True)
         row = column.row(align=True)
-        row.prop(state, "first")
-        row.prop(state, "last")
+        layouts.draw_all(row, state, "first", "last")
         row = column.row(align=True)
         _draw_show(row, "Show Only", state.first, state.last, "ONLY")
         _draw_show(row, "Show", state.first, state.last, "SHOW", icon="HIDE_OFF")

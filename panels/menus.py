@@ -12,6 +12,12 @@ from ..addon.phantoms.phantom_properties import menu_entries
 from ..addon.scanner import selection
 
 
+def draw_commands(layout: bpy.types.UILayout, **icons: str) -> None:
+    """Draw entries of commands, given by their operators' names and icons, without values of their own."""
+    for name, icon in icons.items():
+        layout.operator(f"mphdrr.{name}", icon=icon)
+
+
 class MPHDRR_MT_add(bpy.types.Menu):
     bl_label = "mphDRR"
 
@@ -48,10 +54,8 @@ class MPHDRR_MT_modules(bpy.types.Menu):
 
     def draw(self, context: bpy.types.Context) -> None:
         layout = invoking(self.layout)
-        layout.operator("mphdrr.import_geometry", icon="IMPORT")
-        layout.operator("mphdrr.add_xray_system", icon="LIGHT_SPOT")
-        layout.operator("mphdrr.export_geometry", icon="EXPORT")
-        layout.operator("mphdrr.export_for_program")
+        draw_commands(layout, import_geometry="IMPORT", add_xray_system="LIGHT_SPOT", export_geometry="EXPORT")
+        draw_commands(layout, export_for_program="NONE")
         layout.separator()
         state = context.scene.mphdrr_geometry
         text = iface("Show Only Modules {first} to {last}").format(first=state.first, last=state.last)
@@ -63,20 +67,14 @@ class MPHDRR_MT_modules(bpy.types.Menu):
         look.number = camera.mphdrr_module.number if camera else 1
         layout.operator("mphdrr.isolate_ring")
         layout.separator()
-        layout.operator("mphdrr.duplicate_modules", icon="DUPLICATE")
-        layout.operator("mphdrr.remove_modules", icon="TRASH")
-        layout.operator("mphdrr.aim_modules", icon="CON_TRACKTO")
-        layout.operator("mphdrr.reset_cameras", icon="LOOP_BACK")
-        layout.operator("mphdrr.tidy_modules", icon="BRUSH_DATA")
+        draw_commands(layout, duplicate_modules="DUPLICATE", remove_modules="TRASH", aim_modules="CON_TRACKTO")
+        draw_commands(layout, reset_cameras="LOOP_BACK", tidy_modules="BRUSH_DATA")
         layout.operator_menu_enum("mphdrr.renumber_modules", "order", icon="LINENUMBERS_ON")
         layout.separator()
-        layout.operator("mphdrr.check_geometry", icon="CHECKMARK")
-        layout.operator("mphdrr.optimise", icon="OPTIONS")
-        layout.operator("mphdrr.calibrate", icon="TRACKER")
+        draw_commands(layout, check_geometry="CHECKMARK", optimise="OPTIONS", calibrate="TRACKER")
         layout.operator_menu_enum("mphdrr.add_map", "quantity", icon="OUTLINER_DATA_LIGHTPROBE")
         layout.separator()
-        layout.operator("mphdrr.set_up_scene", icon="SCENE_DATA")
-        layout.operator("mphdrr.remove_scanner", icon="TRASH")
+        draw_commands(layout, set_up_scene="SCENE_DATA", remove_scanner="TRASH")
 
 
 class MPHDRR_MT_module(bpy.types.Menu):
@@ -87,8 +85,7 @@ class MPHDRR_MT_module(bpy.types.Menu):
     def draw(self, context: bpy.types.Context) -> None:
         pie = invoking(self.layout.menu_pie())  # entries to the west, east, south, north, and between them
         draw_module(pie, selection.active_module(context))
-        pie.operator("mphdrr.render_projections", icon="RENDER_STILL")
-        pie.operator("mphdrr.reconstruct", icon="OUTLINER_OB_VOLUME")
+        draw_commands(pie, render_projections="RENDER_STILL", reconstruct="OUTLINER_OB_VOLUME")
         pie.operator("mphdrr.show_modules", text="Show All Modules", icon="HIDE_OFF").mode = "ALL"
         pie.menu("MPHDRR_MT_commands", text="All Commands", icon="COLLAPSEMENU")
 
@@ -97,9 +94,7 @@ def draw_module(layout: bpy.types.UILayout, camera: bpy.types.Object | None) -> 
     """Draw the commands that work on one module, given by its camera, or on module 1."""
     look = layout.operator("mphdrr.look_through_module", text="Look Through", icon="OUTLINER_OB_CAMERA")
     look.number = camera.mphdrr_module.number if camera else 1
-    layout.operator("mphdrr.isolate_ring", icon="HIDE_OFF")
-    layout.operator("mphdrr.live_preview", icon="VIEW_CAMERA")
-    layout.operator("mphdrr.pick_pixel", icon="EYEDROPPER")
+    draw_commands(layout, isolate_ring="HIDE_OFF", live_preview="VIEW_CAMERA", pick_pixel="EYEDROPPER")
 
 
 def draw_in_context_menu(menu: bpy.types.Menu, context: bpy.types.Context) -> None:
@@ -116,49 +111,33 @@ class MPHDRR_MT_volumes(bpy.types.Menu):
         layout = invoking(self.layout)
         layout.menu("MPHDRR_MT_add", text="Add Phantom or Volume", icon="ADD")
         layout.separator()
-        layout.operator("mphdrr.update_phantom", icon="FILE_REFRESH")
-        layout.operator("mphdrr.try_event")
-        layout.operator("mphdrr.apply_phantom_pose", icon="OBJECT_ORIGIN")
+        draw_commands(layout, update_phantom="FILE_REFRESH", try_event="NONE", apply_phantom_pose="OBJECT_ORIGIN")
         layout.operator("mphdrr.show_phantom_outline", text="Show or Hide Outline", icon="SHADING_WIRE")
         layout.separator()
         layout.operator("mphdrr.ct_to_attenuation", icon="MOD_FLUIDSIM")
         layout.operator_menu_enum("mphdrr.add_dose_map", "isotope", icon="OUTLINER_DATA_VOLUME")
-        layout.operator("mphdrr.add_slices", icon="MESH_PLANE")
-        layout.operator("mphdrr.remove_slices", icon="X")
-        layout.operator("mphdrr.show_in_perspective", icon="VIEW_PERSPECTIVE")
-        layout.operator("mphdrr.resample_in_perspective", icon="OUTLINER_DATA_VOLUME")
-        layout.operator("mphdrr.clear_perspective", icon="X")
-        layout.operator("mphdrr.voxelize_objects", icon="OUTLINER_DATA_MESH")
-        layout.operator("mphdrr.mesh_from_volume", icon="MESH_DATA")
+        draw_commands(layout, add_slices="MESH_PLANE", remove_slices="X", show_in_perspective="VIEW_PERSPECTIVE")
+        draw_commands(layout, resample_in_perspective="OUTLINER_DATA_VOLUME", clear_perspective="X")
+        draw_commands(layout, voxelize_objects="OUTLINER_DATA_MESH", mesh_from_volume="MESH_DATA")
         layout.separator()
-        layout.operator("mphdrr.export_volume", icon="EXPORT")
-        layout.operator("mphdrr.remake_volumes", icon="FILE_REFRESH")
-        layout.operator("mphdrr.find_volume_files", icon="VIEWZOOM")
-        layout.operator("mphdrr.collect_files", icon="FILE_FOLDER")
-        layout.operator("mphdrr.clean_volume_files", icon="TRASH")
-        layout.operator("mphdrr.add_looks", icon="ASSET_MANAGER")
+        draw_commands(layout, export_volume="EXPORT", remake_volumes="FILE_REFRESH", find_volume_files="VIEWZOOM")
+        draw_commands(layout, collect_files="FILE_FOLDER", clean_volume_files="TRASH", add_looks="ASSET_MANAGER")
 
 
 class MPHDRR_MT_projections(bpy.types.Menu):
     def draw(self, context: bpy.types.Context) -> None:
         layout = invoking(self.layout)
-        layout.operator("mphdrr.render_projections", icon="RENDER_STILL")
-        layout.operator("mphdrr.import_counts", icon="IMPORT")
-        layout.operator("mphdrr.live_preview", icon="VIEW_CAMERA")
-        layout.operator("mphdrr.show_projections", icon="IMAGE_DATA")
+        draw_commands(layout, render_projections="RENDER_STILL", import_counts="IMPORT", live_preview="VIEW_CAMERA")
+        draw_commands(layout, show_projections="IMAGE_DATA")
         layout.operator_menu_enum("mphdrr.pick_window", "end", icon="EYEDROPPER")
-        layout.operator("mphdrr.pick_pixel", icon="EYEDROPPER")
-        layout.operator("mphdrr.clear_pixel", icon="X")
+        draw_commands(layout, pick_pixel="EYEDROPPER", clear_pixel="X")
         layout.separator()
-        layout.operator("mphdrr.reconstruct", icon="OUTLINER_OB_VOLUME")
-        layout.operator("mphdrr.continue_reconstruction", icon="FORWARD")
-        layout.operator("mphdrr.show_reconstruction", icon="IMAGE_DATA")
-        layout.operator("mphdrr.use_ct", icon="MOD_FLUIDSIM")
+        draw_commands(layout, reconstruct="OUTLINER_OB_VOLUME", continue_reconstruction="FORWARD")
+        draw_commands(layout, show_reconstruction="IMAGE_DATA", use_ct="MOD_FLUIDSIM")
         layout.operator_menu_enum("mphdrr.backproject", "how", icon="OUTLINER_DATA_VOLUME")
         layout.separator()
         layout.operator_menu_enum("mphdrr.new_event_recipe", "like", icon="FILE_NEW")
-        layout.operator("mphdrr.make_event_set", icon="FILE_CACHE")
-        layout.operator("mphdrr.open_event", icon="OUTLINER_OB_VOLUME")
+        draw_commands(layout, make_event_set="FILE_CACHE", open_event="OUTLINER_OB_VOLUME")
         layout.separator()
         settings = context.scene.mphdrr_projections
         layout.operator_menu_enum("mphdrr.compare_runs", "other", icon="SELECT_DIFFERENCE")
@@ -166,8 +145,5 @@ class MPHDRR_MT_projections(bpy.types.Menu):
         layout.operator("mphdrr.remove_run", icon="TRASH").index = settings.active_run
         layout.separator()
         layout.operator_menu_enum("mphdrr.use_preset", "preset", icon="PRESET")
-        layout.operator("mphdrr.load_recipe", icon="FILE_FOLDER")
-        layout.operator("mphdrr.export_dataset", icon="EXPORT")
-        layout.operator("mphdrr.export_figure", icon="IMAGE_DATA")
-        layout.operator("mphdrr.render_picture", icon="RENDER_STILL")
-        layout.operator("mphdrr.render_animation", icon="RENDER_ANIMATION")
+        draw_commands(layout, load_recipe="FILE_FOLDER", export_dataset="EXPORT", export_figure="IMAGE_DATA")
+        draw_commands(layout, render_picture="RENDER_STILL", render_animation="RENDER_ANIMATION")

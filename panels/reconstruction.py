@@ -34,8 +34,7 @@ class MPHDRR_PT_reconstruction(Folded, bpy.types.Panel):
         row = layout.row(align=True)
         row.popover("MPHDRR_PT_backprojection")
         row.popover("MPHDRR_PT_reconstruction_model", icon="PREFERENCES")
-        result = settings.details
-        if result and settings.volume is not None:
+        if (result := settings.details) and settings.volume is not None:
             _draw_result(layout, settings, result)
 
 

@@ -28,10 +28,9 @@ class MPHDRR_GGT_slices(bpy.types.GizmoGroup):
 
             def get(axis: int = axis) -> float:
                 """Return the handle's position along the axis."""
-                item = slices.active_sliced_volume(bpy.context)
-                return (
-                    0.0 if item is None else slices.slice_track(item, axis)[1].length * item.mphdrr_volume.slices[axis]
-                )
+                if (item := slices.active_sliced_volume(bpy.context)) is None:
+                    return 0.0
+                return slices.slice_track(item, axis)[1].length * item.mphdrr_volume.slices[axis]
 
             def set(value: float, axis: int = axis) -> None:
                 """Move the slice of the axis to the handle's position."""

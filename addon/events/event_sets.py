@@ -12,6 +12,7 @@ from mathutils import Matrix
 from numpy.typing import NDArray
 
 from ...core import InputError, ProjectionRun, events, memory
+from ...core.cli.options import count_text
 from ...core.events.folders import SetFolder
 from ...core.events.templates import template_text
 from ...core.example import EXAMPLE
@@ -120,11 +121,11 @@ def make_set_job(filepath: str, folder: str, count: int) -> jobs.Job:
         if not new_events:
             return f"All events asked for are there already: {n_events} in {path}"
         size = memory.readable_size(sum(event.size for event in new_events))
-        return f"Made {_events_text(len(new_events))}, {size} in {seconds:.1f} s: {n_events} in {path}"
+        return f"Made {count_text(len(new_events), 'event')}, {size} in {seconds:.1f} s: {n_events} in {path}"
 
     def leftovers() -> str:
         """Return the line for a cancelled job: the number of events that were made and stay."""
-        return f"{_events_text(len(new_events))} made now and kept; Make Event Set goes on from there"
+        return f"{count_text(len(new_events), 'event')} made now and kept; Make Event Set goes on from there"
 
     return jobs.Job("Making an event set", work, finish, leftovers=leftovers)
 
@@ -162,8 +163,7 @@ def open_event_job(context: bpy.types.Context, folder: str, number: int, model: 
         stages("writing the voxels")
         truth = stored_volumes.store_volume(event.truth, files, event.placement, {"event": number, "set": str(path)})
         phantom = None if planned.entry.kind is None else _store_phantom(planned, target, files, progress)
-        models = planned.recipe.models
-        if not models:
+        if not (models := planned.recipe.models):
             return _StoredEvent(name, _describe(planned), truth, phantom, None, None)
         run = event.run(model or next(iter(models)))
         run = replace(run, settings={**run.settings, "volume": name})
@@ -219,10 +219,9 @@ def _recipe_reader(filepath: str, folder: str) -> Callable[[], events.EventRecip
 def _read_event(path: Path, number: int) -> events.Event:
     """Return an event of a set; raise `InputError` where the set lacks it."""
     event_set = events.EventSet(path)
-    event = next((event for event in event_set if event.number == number), None)
-    if event is None:
+    if (event := next((event for event in event_set if event.number == number), None)) is None:
         numbers = event_set.numbers
-        content = f"{_events_text(len(numbers))}, {numbers[0]} to {numbers[-1]}" if len(numbers) else "no events"
+        content = f"{count_text(len(numbers), 'event')}, {numbers[0]} to {numbers[-1]}" if len(numbers) else "no events"
         raise InputError(f"event {number}: not in {path}, which holds {content}")
     return event
 
@@ -317,8 +316,3 @@ def _describe(planned: events.PlannedEvent) -> str:
     for name, factor in (("size", planned.size), ("activity", planned.activity_factor)):
         words += [f"{name} × {factor:.3g}"] if factor != 1.0 else []
     return ", ".join(words)
-
-
-def _events_text(count: int) -> str:
-    """Return a number of events in words."""
-    return f"{count} event{'s' * (count != 1)}"

@@ -183,8 +183,7 @@ def _render_film(stage: FigureScene, style: Rendering, path: Path, reel: Reel) -
         old_picture.unlink()  # an older animation may have been longer
     shown_moment, page = None, stage.page
     for k in range(style.frames):
-        moment = stage.moment(k / style.frames)
-        if moment != shown_moment:
+        if (moment := stage.moment(k / style.frames)) != shown_moment:
             stage.show(*moment)
             shown_moment, page = moment, Page(page.width, page.height, page.paper)
             yield from _render_picture(stage, style, page)

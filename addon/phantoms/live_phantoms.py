@@ -46,7 +46,6 @@ def _update_edited() -> float | None:
         return _PAUSE
     item = bpy.data.objects.get(_edited_name)
     if item is not None and phantoms.settings_of(item) is not None and item.mphdrr_volume.outdated:
-        window = bpy.context.window_manager.windows[0]
-        with bpy.context.temp_override(window=window, object=item):
+        with bpy.context.temp_override(window=bpy.context.window_manager.windows[0], object=item):
             bpy.ops.mphdrr.update_phantom("INVOKE_DEFAULT")
     return None

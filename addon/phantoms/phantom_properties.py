@@ -154,8 +154,7 @@ def settings_class(kind: PhantomKind, name: str, bases: tuple[type, ...], update
 
 def plain_settings(name: str, **values: Any) -> KindSettings:
     """Return a kind's default settings for scripts, with `values` in their place; raise `InputError` for an unknown name."""
-    kind = next((kind for kind in KINDS if name in (kind.name, identifier(kind))), None)
-    if kind is None:
+    if (kind := next((kind for kind in KINDS if name in (kind.name, identifier(kind))), None)) is None:
         raise InputError(f"phantom {name!r}: expected one of {', '.join(kind.name for kind in KINDS)}")
     settings = KindSettings()
     defaults = {field.name: kind.usual.get(field.name, field.default) for field in _setting_fields(kind)}

@@ -28,8 +28,7 @@ def backproject_job(context: bpy.types.Context, recipe: Recipe, how: str) -> job
         stages = stages_of(progress)
         stages("reading the run")
         run = read_run(path)
-        grid = reconstruction_grid(run, recipe)
-        volume = backproject_run(run, how, grid=grid, stages=stages)
+        volume = backproject_run(run, how, grid=reconstruction_grid(run, recipe), stages=stages)
         stages("writing the voxels")
         provenance: dict[str, Any] = {"back_projection_of": name, "how": how, **recipe.tables()}
         return stored_volumes.store_volume(volume, folder, None, provenance)

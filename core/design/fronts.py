@@ -41,8 +41,7 @@ class Front:
 
     def write(self, path: AnyPath) -> None:
         """Write the table (.csv, .json) or the plot (.png, .svg)."""
-        ending = require_ending(path, (".csv", ".json", *SUFFIXES))
-        if ending in SUFFIXES:
+        if (ending := require_ending(path, (".csv", ".json", *SUFFIXES))) in SUFFIXES:
             self._draw_plot().write(path)
             return
         cells = [list(self.rows[0]), *(list(row.values()) for row in self.rows)]

@@ -33,8 +33,7 @@ def central_differences(function: Callable[[Floats], Floats], rows: Floats) -> F
     `rows` is (N, K), K = 15 or a multiple of it. The functions differentiated here are smooth and cheap, and the error of
     central differences is about 1e-9 of the derivative.
     """
-    steps = np.tile(STEPS, rows.shape[1] // len(STEPS))
-    shifts = np.diag(steps)
+    shifts = np.diag(np.tile(STEPS, rows.shape[1] // len(STEPS)))
     derivatives = [(function(rows + shift) - function(rows - shift)) / (2 * shift.sum()) for shift in shifts]
     return np.stack(derivatives, axis=1)
 

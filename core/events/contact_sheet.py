@@ -265,8 +265,7 @@ def _draw_panel(page: Page, panel: _Panel, left: int, top: int) -> None:
     if panel.pixels_per_mm:
         extent = panel.width / panel.pixels_per_mm
         length = [step for step in (1, 2, 5, 10, 20, 50, 100, 200, 500) if step <= max(1.0, extent / 3)][-1]
-        wide = length * panel.pixels_per_mm
-        page.area(box(x + 10, y + panel.height - 14, wide, 4), _CROSS)
+        page.area(box(x + 10, y + panel.height - 14, length * panel.pixels_per_mm, 4), _CROSS)
         page.text(f"{length} mm", x + 10, y + panel.height - 20, _TEXT, _CROSS)
     page.text(panel.above, left, top - 10, _TEXT, _INK)
     page.text(panel.below, left, top + _SIDE + 20, _TEXT, _FAINT)

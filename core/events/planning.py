@@ -103,8 +103,7 @@ class PlannedEvent:
 
     def _make_phantom(self) -> Phantom | None:
         """Return the phantom of the drawn kind and settings, or read it from its file; None for a volume."""
-        kind = self.entry.kind
-        if kind is not None:
+        if (kind := self.entry.kind) is not None:
             names = setting_names(kind.phantom)
             arguments = {names[key]: _as_tuples(value) for key, value in self.settings.items()}
             return kind.phantom(**{**kind.usual, **arguments})

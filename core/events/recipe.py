@@ -103,6 +103,7 @@ class EventRecipe:
     name: str = "recipe"
     folder: Path = field(default_factory=Path)
     inputs: Mapping[str, Input] = field(default_factory=dict)
+    _read_inputs: dict[str, Input] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         with naming(self.name):
@@ -239,11 +240,6 @@ class EventRecipe:
         """SHA-256 of the recipe's values and of the contents of all files that it names, without comments."""
         values = self._replace_file_names(lambda name, content: f"sha256:{self.input(name).sha256}")
         return hashlib.sha256(json.dumps(values, sort_keys=True, default=str).encode()).hexdigest()
-
-    @cached_property
-    def _read_inputs(self) -> dict[str, Input]:
-        """Files of the recipe that have been read so far, by their names in the recipe."""
-        return {}
 
     def _model_recipe(self, entries: dict[str, Any]) -> Recipe:
         """Return the recipe of projection runs of one table [models.NAME]; `InputError` where it does not fit the truth."""

@@ -250,8 +250,7 @@ def _phantom_solids(simulation: Simulation) -> tuple[PlacedSolids | None, list[t
     if simulation.derenzo is None:
         return None, []
     material, pose, height = simulation.phantom_material, simulation.world_from_phantom, simulation.derenzo.height
-    table = simulation.derenzo.rods()
-    sector, x, y, diameter = table.T
+    sector, x, y, diameter = simulation.derenzo.rods().T
     reach = max(float((np.hypot(x, y) + diameter / 2).max()), simulation.derenzo.radius)
     size = (reach + 1.0, height + 2.0)
     body = PlacedSolids("phantom", "world", "cylinder", size, material, pose[None, :3, 3], pose[None, :3, :3])

@@ -41,8 +41,7 @@ def edge_slope(opening_angle: float) -> float:
 
 def angle_from_degrees(degrees: float, name: str = "opening_degrees") -> float:
     """Return an opening angle, given in degrees, in rad; raise `InputError` unless it is between 0 and 180 degrees."""
-    degrees = positive(degrees, name, "degrees")
-    if degrees >= 180:
+    if (degrees := positive(degrees, name, "degrees")) >= 180:
         raise InputError(f"{name}: expected less than 180 degrees, got {degrees:g}")
     return math.radians(degrees)
 

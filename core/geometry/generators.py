@@ -123,8 +123,7 @@ def regular_polygon(sides: int, apothem: float, rotation: float = 0.0) -> Floats
 
     The plates are `apothem` mm from the isocentre; the middle of the first has the azimuth `rotation`, rad.
     """
-    sides = whole_number(sides, "sides")
-    if sides < 3:
+    if (sides := whole_number(sides, "sides")) < 3:
         raise InputError(f"sides: expected at least 3, got {sides}")
     angles = float(radians(rotation, "rotation")) + (2 * np.arange(sides) - 1) * math.pi / sides
     radius = positive(apothem, "apothem", "mm") / math.cos(math.pi / sides)
@@ -137,12 +136,10 @@ def even_azimuths(ellipse: Ellipse, modules: Any, start: float, end: float, spac
     `modules` is their number; `start` and `end` are the azimuths of the first and last, rad, and `spacing` is "angle" or
     "arc", as described at `ellipse_rings`.
     """
-    count = whole_number(modules, "modules")
-    if count > _MAX_MODULES:
+    if (count := whole_number(modules, "modules")) > _MAX_MODULES:
         raise InputError(f"modules: expected at most {_MAX_MODULES} in a ring, got {count}")
     start, end = (float(real_array(x, name, ())) for x, name in ((start, "start"), (end, "end")))
-    turn = abs(end - start)
-    if turn > FULL_TURN + 1e-9:
+    if (turn := abs(end - start)) > FULL_TURN + 1e-9:
         raise InputError(f"start and end: expected at most a full turn apart, got {math.degrees(turn):g} degrees")
     closed = turn >= FULL_TURN - 1e-9
     fractions = np.linspace(0, 1, count, endpoint=not closed)  # positions between start and end

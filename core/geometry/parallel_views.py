@@ -51,8 +51,7 @@ def parallel_views(
     >>> views = parallel_views(np.arange(180) * np.pi / 180, (128, 128), 1.0)
     >>> images = Projector(grid, views)(volume)
     """
-    angles = radians(angles, "angles", (None,))
-    if not len(angles):
+    if not len(angles := radians(angles, "angles", (None,))):
         raise InputError("angles: expected one or more, got none")
     shape = whole_shape(shape, "image shape", 2)
     pitch_u, pitch_v = lengths(pitch, "pixel pitch", 2)

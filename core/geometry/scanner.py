@@ -88,8 +88,7 @@ class Scanner(ABC):
             values = getattr(self, name) if name in names else column.default(self.columns.needed_values(self))
             target = attributes if name in attributes else more
             target[name] = freeze(column.check_values(values, n))
-            n = len(target[name])
-            if n == 0:
+            if (n := len(target[name])) == 0:
                 raise InputError(f"a {self.kind} system needs at least one module, got none")
         listed = np.arange(1, (n or 0) + 1) if self.numbers is None else self.numbers
         numbers = freeze(real_array(listed, "numbers", (n,), np.int64))

@@ -56,8 +56,7 @@ class Source:
         """All events of the set."""
         path = self.recipe.path("data.events")
         with naming("data.events"):
-            events = EventSet(path)
-            if not len(events):
+            if not len(events := EventSet(path)):
                 raise InputError(f"{path}: it holds no events")
         return events
 
@@ -118,8 +117,7 @@ class Source:
         """Return the samples of a split as pairs of event and draw; each validation event has one draw."""
         n_draws = 1 if split == self.recipe["data.validation"] else self.recipe["data.draws"]
         with naming("data"):
-            numbers = self.events.split(split).numbers
-            if not numbers:
+            if not (numbers := self.events.split(split).numbers):
                 raise InputError(f"the split {split!r} of {self.recipe.path('data.events')} holds no events")
         return [(number, draw) for number in numbers for draw in range(n_draws)]
 

@@ -142,6 +142,9 @@ class TrainedNetwork:
     path: Path
     sha256: str
     contents: ModelContents
+    _last_setup: list[ScannerSetup] = field(
+        default_factory=list, init=False, repr=False
+    )  # of the last scan, at most one
 
     def __call__(self, run: ProjectionRun, allow: Sequence[str] = ()) -> Volume:
         """Reconstruct a run by the same scanner and physics, on the network's grid.
@@ -221,11 +224,6 @@ class TrainedNetwork:
             del _SETUPS[next(iter(_SETUPS))]
         return _SETUPS[key]
 
-    @cached_property
-    def _last_setup(self) -> list[ScannerSetup]:
-        """Setup of the last scan, in a list of one."""
-        return []
-
     def reconstruct(
         self,
         A: Projector,
@@ -271,8 +269,7 @@ class TrainedNetwork:
         for name in allow:
             one_of(name, ALLOWED, "allow")
         differing = self.contents.differing(setup)
-        refused = [name for name in differing if name not in allow]
-        if refused:
+        if refused := [name for name in differing if name not in allow]:
             names = " and ".join(refused)
             raise InputError(f"{self.path}: trained for another {names}; --allow {' '.join(refused)} takes it anyway")
         return [f"{self.path.name} was trained for another {name}, which was allowed" for name in differing]

@@ -132,8 +132,7 @@ def shadow_edges(views: Views, m: int, grid: Grid) -> Floats:
     They are voxels in front of the source and within the image, or, if there are none, in front of the source.
     """
     ticks = [np.unique(np.linspace(0, n - 1, min(n, _VOXELS_ALONG)).round()) for n in grid.shape]
-    index = np.stack(np.meshgrid(*ticks, indexing="ij"), axis=-1).reshape(-1, 3)
-    centers = moved(grid.affine, index)
+    centers = moved(grid.affine, np.stack(np.meshgrid(*ticks, indexing="ij"), axis=-1).reshape(-1, 3))
     matrix = views[m].projection_matrices()[0]
     column, row, factor = matrix[:, :3] @ centers.T + matrix[:, 3:]
     nearest = 1e-6 * np.abs(factor).max()  # a voxel at the source has no shadow

@@ -358,8 +358,7 @@ def _sample_cells(lattice: Lattice) -> Floats:
 
 def _positions(matrix: Floats, target: Lattice, index: Floats) -> Floats:
     """Return the source's array indices (N, 3) of the target's cells `index` (N, 3); NaN for cells not in front."""
-    third = _planes_at(target, index[:, 2])
-    p = np.column_stack([index[:, :2], third, np.ones(len(index))]) @ matrix.T
+    p = np.column_stack([index[:, :2], _planes_at(target, index[:, 2]), np.ones(len(index))]) @ matrix.T
     front = (p[:, 3] > 0) & (p[:, 4] > 0)
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.where(front[:, None], p[:, :3] / p[:, [3, 3, 4]], np.nan)

@@ -34,8 +34,7 @@ class PointGrid(Phantom):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        steps = [step for step, n in zip(self.spacing, self.counts, strict=True) if n > 1]
-        if steps:
+        if steps := [step for step, n in zip(self.spacing, self.counts, strict=True) if n > 1]:
             require_at_most(self.diameter, min(steps), f"{self.title}: diameter", "from point to point")
 
     @cached_property

@@ -103,8 +103,7 @@ def oblique_kernel(zone: DepthZone, effects: DirectionalEffects, position: Array
         variance = np.average((hole_scales - np.average(hole_scales, 0, depth_weights)) ** 2, 0, depth_weights)
         mixing_variance = variance * (zone.node_spacing * cells_per_pixel) ** 2 / 8
     ellipse_forms = np.stack([forms[:, 0, 0], forms[:, 1, 1], 2 * forms[:, 0, 1]], -1)
-    ellipse_centers = np.outer(off_center, axis) / cell_size
-    ellipses = ellipse_forms, ellipse_centers, ellipse_weights
+    ellipses = ellipse_forms, np.outer(off_center, axis) / cell_size, ellipse_weights
     return ObliqueKernel(*ellipses, depth_shifts, hole_scales, depth_weights, mixing_variance)
 
 

@@ -448,8 +448,7 @@ def _warnings(grid: Grid, views: Views, model: Model) -> Iterator[str]:
     """Yield the warnings about a projector's arguments that look wrong, each with its number."""
     if caution := model.caution(views, grid):
         yield caution
-    width = float(np.ptp(grid.corners(), axis=0).max())
-    if width < _NARROW and max(grid.shape) > 3:
+    if (width := float(np.ptp(grid.corners(), axis=0).max())) < _NARROW and max(grid.shape) > 3:
         distance = float(np.linalg.norm(views.sources - grid.center, axis=1).min())
         yield f"the grid is {width:.3g} mm wide, {distance:.3g} mm from the sources: lengths are in mm; is it in metres?"
     yield from model.coefficient_warnings()

@@ -21,8 +21,7 @@ def balanced_subsets(views: Views, n: int) -> list[NDArray[np.int64]]:
     The views are dealt out like cards, ring by ring along z, each ring by the sources' angle around z. Each ring begins
     at another angle than the ring before, so that a subset does not have the same angle of every ring.
     """
-    n = whole_number(n, "subsets")
-    if n > len(views):
+    if (n := whole_number(n, "subsets")) > len(views):
         raise InputError(f"subsets: expected at most the {len(views)} views, got {n}")
     x, y, z = views.sources.T
     ring = rings_along_z(z, _RING_GAP * float(np.linalg.norm(views.sources, axis=1).mean()))

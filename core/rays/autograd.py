@@ -68,8 +68,7 @@ class _Step(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
-        needs = ctx.needs_input_grad[1:]
-        return None, *_Once.apply(ctx.gradients, needs, gradient, *ctx.saved_tensors)
+        return None, *_Once.apply(ctx.gradients, ctx.needs_input_grad[1:], gradient, *ctx.saved_tensors)
 
 
 class _Once(torch.autograd.Function):

@@ -72,8 +72,7 @@ def sirt(
     Theoretical Biology 36 (1972) 105-117. J. Gregor, T. Benson, "Computational analysis and improvement of SIRT", IEEE
     Transactions on Medical Imaging 27 (2008) 918-924.
     """
-    relaxation = positive(relaxation, "relaxation")
-    if relaxation >= 2:
+    if (relaxation := positive(relaxation, "relaxation")) >= 2:
         raise InputError(f"relaxation: expected less than 2, got {relaxation:g}")
     loop = LeastSquaresLoop("SIRT", A, images, iterations, nonnegative, *options, **named)
     R = safe_inverse(loop.forward(loop.weights, loop.preparing()))

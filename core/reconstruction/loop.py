@@ -177,8 +177,7 @@ class Loop:
                 if self._callback is not None and self._callback(self.n_done, self.values):
                     return self._result(settings, "callback")
                 seconds = time.monotonic() - self._start_time
-                reason = self._stop and self._stop.reason(self._objective, self.values, seconds)
-                if reason:
+                if reason := self._stop and self._stop.reason(self._objective, self.values, seconds):
                     return self._result(settings, reason)
         except Cancelled as cancelled:
             cancelled.reconstruction = result

@@ -298,10 +298,9 @@ class Penalty:
     def __init__(self, prior: Prior, grid: Grid, inside: Bools | None = None) -> None:
         self._prior, self._shape, self._threads = prior, grid.shape, thread_count(None)
         self._inside = None if inside is None or inside.all() else inside
-        steps = _half_of_neighbors(prior.neighbors)
-        lengths = [float(np.linalg.norm(grid.affine[:3, :3] @ step)) for step in steps]
+        self._steps = _half_of_neighbors(prior.neighbors)
+        lengths = [float(np.linalg.norm(grid.affine[:3, :3] @ step)) for step in self._steps]
         self._closeness = [min(lengths) / length for length in lengths]
-        self._steps = steps
         self._selections = None if prior.anatomy is None else self._bowsher_selections(prior.anatomy, grid)
 
     def value(self, x: Array) -> float:

@@ -34,8 +34,7 @@ def exr_bytes(picture: ArrayLike) -> bytes:
     for line in range(0, height, _LINES):
         data = _packed(pixels[line : line + _LINES].tobytes())
         blocks.append(struct.pack("<2i", line, len(data)) + data)
-    first_block = len(header) + 8 * len(blocks)
-    starts = first_block + np.cumsum([0, *map(len, blocks[:-1])])
+    starts = len(header) + 8 * len(blocks) + np.cumsum([0, *map(len, blocks[:-1])])
     return b"".join([header, starts.astype("<u8").tobytes(), *blocks])
 
 

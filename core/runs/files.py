@@ -72,8 +72,7 @@ def _read_scanner(arrays: dict[str, Array], attributes: dict[str, Any]) -> Scann
     kind = scanner_kind(attributes.get(_KIND, _PINHOLE))
     values = {"numbers": arrays["geometry/number"], **json.loads(attributes.get(_TEXTS, "{}"))}
     for name, (column, *_) in kind.columns.fields.items():
-        place = f"geometry/{_FILE_NAMES.get(name, name)}"
-        if place in arrays:
+        if (place := f"geometry/{_FILE_NAMES.get(name, name)}") in arrays:
             values[name] = arrays[place]
         elif name not in values and not column.has_constant_blank:
             raise InputError(f"array {place} is missing")
@@ -101,8 +100,7 @@ def write_run(run: ProjectionRun, path: AnyPath) -> None:
     Raises `InputError` for another ending, if torch is missing for .pt, or if the file cannot be written; an existing file
     then stays as it is.
     """
-    ending = require_ending(path, EXPORT_FORMATS)
-    if ending == ".dcm":
+    if (ending := require_ending(path, EXPORT_FORMATS)) == ".dcm":
         write_counts(run, path)
         return
     pack_file, _ = _FORMATS[ending]

@@ -256,8 +256,7 @@ def _smallest_detail(run: ProjectionRun) -> float:
         return float(min(diameters))
     if not isinstance(run.system, PinholeSystem):
         return np.inf
-    fwhm = resolution(run.system, np.zeros((1, 3)))
-    return float(np.fmin.reduce(fwhm, axis=None, initial=np.inf))
+    return float(np.fmin.reduce(resolution(run.system, np.zeros((1, 3))), axis=None, initial=np.inf))
 
 
 def reconstruction_model(run: ProjectionRun, recipe: Recipe) -> Recipe:

@@ -79,8 +79,7 @@ class ProjectionRun:
             if self.volume is None:
                 raise InputError("run: without a volume, say the unit of the projections, such as counts")
             object.__setattr__(self, "unit", f"{self.volume.unit} mm")
-        source = self.system.source
-        if source is not None and not self.workbook_sha256:
+        if (source := self.system.source) is not None and not self.workbook_sha256:
             object.__setattr__(self, "workbook", source.path.name)
             object.__setattr__(self, "workbook_sha256", source.sha256)
 
@@ -101,6 +100,5 @@ class ProjectionRun:
 
         (x_u, x_v, x_k) is a point in the module's frame, mm from the pinhole.
         """
-        rotations = self.system.poses()[:, :3, :3]
-        matrices = self.views.projection_matrices()[:, :, :3] @ rotations
+        matrices = self.views.projection_matrices()[:, :, :3] @ self.system.poses()[:, :3, :3]
         return matrices / matrices[:, 2:, 2:]

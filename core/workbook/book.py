@@ -197,8 +197,7 @@ def _is_same_result(stored: Any, computed: Any) -> bool:
 
 def _read_workbook_bytes(path: Path) -> bytes:
     """Return the bytes of a file that looks like an .xlsx workbook; raise `InputError` for any other file."""
-    size = require_file(path, "an .xlsx workbook").stat().st_size
-    if size > MAX_FILE_BYTES:
+    if (size := require_file(path, "an .xlsx workbook").stat().st_size) > MAX_FILE_BYTES:
         raise InputError(f"{path}: {size} bytes, expected a workbook of at most {MAX_FILE_BYTES} bytes")
     content = read_bytes(path)
     if (problem := _describe_other_format(path.name, content)) is not None:

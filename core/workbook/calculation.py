@@ -40,8 +40,7 @@ class Calculation:
         """Return the settled value of the formula at `address`."""
         pending, begun = [address], set()
         while pending:
-            current = pending[-1]
-            if current in self._values:
+            if (current := pending[-1]) in self._values:
                 pending.pop()
                 continue
             begun.add(current)

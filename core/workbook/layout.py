@@ -222,8 +222,7 @@ def match_rows_by_label(modules: ModuleTable, table: ModuleTable) -> tuple[int, 
             location = modules.sheet.location(row, modules.label_column or 1)
             expected = f"a row for it in sheet {table.sheet.name} too, with its {', '.join(table.columns)}"
             raise InputError(f"{location} is module {label}, expected {expected}")
-    extra = [label for label in table.labels if label not in set(modules.labels)]
-    if extra:
+    if extra := [label for label in table.labels if label not in set(modules.labels)]:
         number = f" and {len(extra) - 1} more modules" if len(extra) > 1 else ""
         location = table.sheet.location(row_of[extra[0]], table.label_column or 1)
         problem = f"has module {extra[0]}{number} without coordinates in sheet {modules.sheet.name}"

@@ -157,6 +157,5 @@ def _cell_xml(name: str, value: Any, style: int, formula: str = "") -> str:
 
 def _rows_xml(columns: dict[int, list[str]]) -> dict[int, str]:
     """Return row -> its XML, from the XML of the cells of each column, from row 1 down."""
-    sorted_columns = [columns[column] for column in sorted(columns)]
-    rows = enumerate(zip(*sorted_columns, strict=True), start=1)
+    rows = enumerate(zip(*[columns[column] for column in sorted(columns)], strict=True), start=1)
     return {row: f'<row r="{row}">{"".join(cells)}</row>' for row, cells in rows}

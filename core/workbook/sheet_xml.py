@@ -235,8 +235,7 @@ class SheetXml:
 
     def refuse_array(self, position: Position) -> None:
         """Raise `InputError` for a cell of an array formula of several cells: these change only together."""
-        area = self.cell(position).array
-        if area is not None:
+        if (area := self.cell(position).array) is not None:
             problem = f"{self.name}!{cell_name(position)} is one cell of the array formula or data table {area.name}"
             raise InputError(f"{self._file}: {problem}, expected a cell of its own: its number cannot be changed alone")
 
@@ -318,8 +317,7 @@ class SheetXml:
         if cell.formula is None:
             return b""
         attributes = b' t="array" ref="%b"' % cell_name(position).encode() if cell.is_single_array else b""
-        text = cell.formula[1:]
-        if text != text.strip():
+        if (text := cell.formula[1:]) != text.strip():
             attributes += b' xml:space="preserve"'
         return b"<%bf%b>%b</%bf>" % (self._prefix, attributes, escape_xml(text), self._prefix)
 

@@ -92,10 +92,8 @@ def write_system(
         book = Book(template)
         _refuse_other_suffix(book.workbook, target)
         if system.sheet and book.workbook.find_title(system.sheet) is None:
-            written = _write_with_new_sheet(system, book.workbook, target, temporary)
-        else:
-            written = _write_edited(system, book, column_map, target, temporary)
-    return written
+            return _write_with_new_sheet(system, book.workbook, target, temporary)
+        return _write_edited(system, book, column_map, target, temporary)
 
 
 def _refuse_unstorable_texts(system: Scanner) -> None:

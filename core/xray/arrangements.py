@@ -56,8 +56,7 @@ def xray_arc(
     """
     count = whole_number(n, "number of sources")
     first, last = (float(radians(value, name)) for value, name in ((start, "start"), (end, "end")))
-    span = abs(last - first)
-    if span > FULL_TURN + 1e-9:
+    if (span := abs(last - first)) > FULL_TURN + 1e-9:
         raise InputError(f"start and end: expected at most a full turn apart, got {math.degrees(span):g} degrees")
     distance, height = positive(source_radius, "source_radius", "mm"), float(real_array(z, "z", ()))
     if abs(height) >= distance:

@@ -144,8 +144,7 @@ class SpectralTransmission:
         values = np.array(values, np.float64)
         for m, (along_v, along_u) in enumerate(self._blurs):
             values[:, m] = along_v.T @ values[:, m] @ along_u
-        paths = self.gradient(self._paths(volumes, A), values, mAs)
-        return np.stack([A.T(path) for path in paths])
+        return np.stack([A.T(path) for path in self.gradient(self._paths(volumes, A), values, mAs)])
 
     def scale(self, shape: tuple[int, ...], mAs: ArrayLike) -> Floats:
         """Return the factor from `weights` to the counts of rays of a `shape`: mAs times pixel area and distance factor."""
@@ -168,8 +167,7 @@ class SpectralTransmission:
 
     def _derivative_weights(self) -> Floats:
         """Return the weights (bins * materials, n) of the derivatives by the paths: ``-mu weights``."""
-        weights = -self.weights[:, None] * self.mu
-        return weights.reshape(-1, self.mu.shape[1])
+        return (-self.weights[:, None] * self.mu).reshape(-1, self.mu.shape[1])
 
     def _sums(self, paths: Floats, weights: Floats) -> Floats:
         """Return, for each row of `weights`, the sum over energies of weight times transmittance, (rows, ...)."""

@@ -94,8 +94,7 @@ def _print_point(
     """Print the point that fits the pixels best, its uncertainty and the residuals; `pixels` has (module index, pixel)."""
     module_indices = np.array([m for m, _ in pixels])
     numbers = system.numbers[module_indices].tolist()
-    repeated = [number for number in numbers if numbers.count(number) > 1]
-    if repeated:
+    if repeated := [number for number in numbers if numbers.count(number) > 1]:
         raise mph.InputError(f"--pixel: expected one pixel of each module, got several of module {repeated[0]}")
     sigma = 1.0 if arguments.sigma is None else arguments.sigma
     fit = mph.fit_marker(views, module_indices, [pixel for _, pixel in pixels], sigma)
@@ -132,8 +131,7 @@ def _parse_pixel(system: Scanner, text: str) -> tuple[int, list[float]]:
         number, (column, row) = int(module), map(float, position_text.split(","))
         if not (math.isfinite(column) and math.isfinite(row)):
             raise ValueError
-    index = np.flatnonzero(system.numbers == number)
-    if not len(index):
+    if not len(index := np.flatnonzero(system.numbers == number)):
         lowest, highest = system.numbers.min(), system.numbers.max()
         raise mph.InputError(f"--pixel {text!r}: no module {number}; there are {lowest} to {highest}")
     return int(index[0]), [column, row]

@@ -49,8 +49,7 @@ def plan_export(
     for name in names:
         one_of(name, all_models, "model")
     noise = checked_noise(noise)
-    level = positive(level, "level")
-    if level != 1 and noise is None:
+    if (level := positive(level, "level")) != 1 and noise is None:
         raise InputError("level: needs noise; choose noise as well, or leave it out")
     if noise is not None:
         require_counted(events, names)

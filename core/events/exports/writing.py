@@ -140,8 +140,7 @@ def _count_earlier_events(folder: Path, request: dict[str, Any], rows: list[Row]
         earlier_request = {}
     if not isinstance(earlier_request, dict) or earlier_request.get("format") != _FORMAT:
         raise InputError(f"{folder}: expected a new or empty folder, or one with an export to continue")
-    changed = [name for name in request if earlier_request.get(name) != request[name]]
-    if changed:
+    if changed := [name for name in request if earlier_request.get(name) != request[name]]:
         raise InputError(f"{folder}: holds an export that differs in {', '.join(changed)}; choose another folder")
     path = folder / TABLE
     earlier_rows = _table_cells(path.read_text(encoding="utf-8")) if path.is_file() else []

@@ -62,7 +62,6 @@ def find_thin_plates(
         plate_area = (2 * collimator.front_half_width) ** 2 - math.pi * widest**2
         # Paix's effective area, of which core.physics.optics has the whole law
         hole_area = math.pi / 4 * collimator.diameter * (collimator.diameter + 2 / mu * edge_slope(plate.opening_angle))
-        share = transmission * plate_area / hole_area
-        if share > MAX_TRANSMITTED:
+        if (share := transmission * plate_area / hole_area) > MAX_TRANSMITTED:
             findings.append(ThinPlate(number, plate.plate_thickness, transmission, share))
     return tuple(findings)

@@ -134,8 +134,7 @@ class _JudgeRun:
             for (kind, method), method_scores in zip(methods, scores, strict=True)
         ]  # fmt: skip
         for kind, name in ((BASELINE, "best_baseline"), (ORACLE, "best_on_itself")):
-            candidates = [i for i, row in enumerate(rows) if row["kind"] == kind]
-            if candidates:
+            if candidates := [i for i, row in enumerate(rows) if row["kind"] == kind]:
                 best = min(candidates, key=lambda i: float(rows[i]["nrmse"]))
                 for row, (method_scores, _) in zip(rows, scores, strict=True):
                     comparison = compare_scores(method_scores, scores[best][0], self.recipe["judge.seed"])

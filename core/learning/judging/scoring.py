@@ -61,8 +61,7 @@ class Case:
     @cached_property
     def points(self) -> Floats:
         """Centres (n, 3), mm, of the judge's voxels."""
-        index = np.indices(self.grid.shape).reshape(3, -1).T
-        return moved(self.grid.affine, index)
+        return moved(self.grid.affine, np.indices(self.grid.shape).reshape(3, -1).T)
 
     @cached_property
     def missing(self) -> list[Floats]:
@@ -92,8 +91,7 @@ class Case:
 
     def contrasts(self, volume: Volume, phantom: DerenzoPhantom, rods: Any) -> Any:
         """Return `rod_contrasts` for the event's phantom, which may be mirrored, enlarged and hotter than `phantom`."""
-        contrasts = rod_contrasts(volume, phantom, self.event.placement, rods)
-        return contrasts / self.planned.activity_factor
+        return rod_contrasts(volume, phantom, self.event.placement, rods) / self.planned.activity_factor
 
 
 def as_believed(run: ProjectionRun, system: Scanner | None, file: str) -> ProjectionRun:

@@ -27,8 +27,7 @@ def mean_scores(rows: Rows, drawn: Rows = ()) -> dict[str, Any]:
     summary: dict[str, Any] = {"events": len(rows)}
     for names, source in ((_MEANS, rows), (_DRAWN, drawn)):
         for name in names:
-            values = [row[name] for row in source if name in row]
-            if values:
+            if values := [row[name] for row in source if name in row]:
                 summary[name] = float(np.mean(values))
     summary["megabytes"] = max(row["megabytes"] for row in rows)
     if any("rods" in row for row in rows):

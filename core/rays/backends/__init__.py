@@ -29,7 +29,7 @@ from typing import Any
 import numpy as np
 
 from ...arrays import ArrayOrTensor, to_numpy, to_tensor
-from ...errors import InputError, install_advice, warn
+from ...errors import InputError, first_line, install_advice, warn
 
 
 @dataclass(frozen=True)
@@ -126,7 +126,7 @@ def choose(name: str) -> Backend:
         _require(backend)
     except _CANNOT_LOAD as error:
         remedy = f": {install_advice(_PACKAGES[name])}" if name in _PACKAGES else ""
-        raise InputError(f"backend {name!r} cannot be used ({_reason(error)}){remedy}") from None
+        raise InputError(f"backend {name!r} cannot be used ({first_line(error)}){remedy}") from None
     return backend
 
 
@@ -137,7 +137,7 @@ def _automatic() -> Backend:
         try:
             _require(BACKENDS[name])
         except _CANNOT_LOAD as error:
-            reason = reason or _reason(error)
+            reason = reason or first_line(error)
             continue
         if reason:
             _warn_slower(name, reason)
@@ -170,7 +170,7 @@ def _problem(name: str) -> str:
     try:
         _require(BACKENDS[name])
     except (InputError, *_CANNOT_LOAD) as error:
-        return _reason(error)
+        return first_line(error)
     return ""
 
 
@@ -181,11 +181,6 @@ def states() -> dict[str, str]:
     automatic = next(name for name in _AUTOMATIC if not problems[name])
     texts = {name: f"not found: {problem}" if problem else "found, can be chosen" for name, problem in problems.items()}
     return {**texts, automatic: "found, used automatically"}
-
-
-def _reason(error: BaseException) -> str:
-    """Return the first line of an error."""
-    return str(error).splitlines()[0] if str(error) else type(error).__name__
 
 
 @functools.cache

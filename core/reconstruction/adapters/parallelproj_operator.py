@@ -65,8 +65,7 @@ class ParallelprojOperator:
         eigenvalue = 0.0  # of A.T A
         for _ in range(num_iter):
             x = self.adjoint(self.apply(x))
-            eigenvalue = math.sqrt(float(xp.sum(x * x)))
-            if eigenvalue == 0:
+            if (eigenvalue := math.sqrt(float(xp.sum(x * x)))) == 0:
                 return 0.0
             x = x / eigenvalue
         return math.sqrt(eigenvalue)

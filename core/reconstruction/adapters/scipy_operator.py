@@ -15,20 +15,11 @@ class ScipyOperator(ScipyLinearOperator):
         super().__init__(np.dtype(np.float32), (int(np.prod(A.shape_out)), int(np.prod(A.shape_in))))
 
     def _matmat(self, X: Array) -> Array:
-        """Return the images of the volumes in the columns of X, as columns."""
-        return _apply_to_columns(self._operator, X)
+        """Return the images of the volumes in the columns of X, as columns; they are computed as one batch."""
+        n = X.shape[1]
+        result: Array = self._operator(X.T.reshape(n, *self._operator.shape_in))
+        return result.reshape(n, -1).T
 
-    def _rmatmat(self, X: Array) -> Array:
-        """Return the adjoint of the images in the columns of X, as columns."""
-        return _apply_to_columns(self._operator.T, X)
-
-    def _rmatvec(self, x: Array) -> Array:
-        """Return the adjoint of flat images, flat."""
-        return self._rmatmat(x.reshape(-1, 1))[:, 0]
-
-
-def _apply_to_columns(A: LinearOperator, columns: Array) -> Array:
-    """Return the matrix whose columns are `A` applied to each of `columns` (n_in, n), computed as one batch."""
-    n = columns.shape[1]
-    result: Array = A(columns.T.reshape(n, *A.shape_in))
-    return result.reshape(n, -1).T
+    def _adjoint(self) -> "ScipyOperator":
+        """Return the adjoint, from flat images to flat volumes."""
+        return ScipyOperator(self._operator.T)

@@ -146,8 +146,7 @@ def nema_score(volume: Volume, phantom: NemaBody, pose: ArrayLike | None = None)
 
 def _background_level(background: Floats) -> float:
     """Return the mean C_B of the background regions' means; raise `InputError` unless it is above 0."""
-    level = float(background.mean())
-    if level <= 0:
+    if (level := float(background.mean())) <= 0:
         raise InputError(f"nema_score: expected activity in the background, got a mean of {level:g} kBq/mL")
     return level
 
@@ -175,8 +174,7 @@ def _means(volume: Volume, world: Floats, centers: Floats, diameter: float, name
 def _background_positions(phantom: NemaBody) -> Floats:
     """Return x and y (12, 2), mm, of the background regions in the phantom's frame; `InputError` if there is no room."""
     body = next(shape for shape in phantom.shapes if shape.name == "front")
-    low = body.position[2] - phantom.length / 2
-    if low > min(_SLICES):
+    if (low := body.position[2] - phantom.length / 2) > min(_SLICES):
         expected = f"a body that reaches from the spheres {-min(_SLICES):g} mm down"
         raise InputError(f"nema_score: expected {expected}, got {-low:g}")
     margin = _CLEARANCE + _LARGEST / 2

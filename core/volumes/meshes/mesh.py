@@ -160,8 +160,7 @@ def require_closed(mesh: Mesh) -> None:
         (n_faces % 2, "it is not closed", "expected an even number of faces at each edge: fill the holes"),
         (direction_sum, "faces look to different sides", "expected all to look outwards: recalculate the normals"),
     ):
-        wrong = np.flatnonzero(is_wrong)
-        if len(wrong):
+        if len(wrong := np.flatnonzero(is_wrong)):
             x, y, z = vertices[first[edge[:, wrong[0]]]].mean(axis=0)
             count = f"{len(wrong)} edge{'s' * (len(wrong) > 1)}"
             raise InputError(f"mesh: {fault} at {count}, the first at ({x:.4g}, {y:.4g}, {z:.4g}) mm; {remedy}")

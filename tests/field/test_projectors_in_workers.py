@@ -60,32 +60,20 @@ def test_a_projector_is_the_same_in_another_process(make, rng, name):
     np.testing.assert_array_equal(pickle.loads(pickle.dumps(A))(x), A(x), "also after its use")
 
 
-class Images:
-    """Dataset of the images of ones that a projector and a DRR make."""
-
-    def __init__(self, A, drr):
-        self.A, self.drr = A, drr
-
-    def __len__(self):
-        return 2
-
-    def __getitem__(self, index):
-        import torch
-
-        matrix = torch.eye(4, dtype=torch.float64)
-        matrix[2, 3] = -100.0 * (index + 1)
-        return (index + 1) * self.A(np.ones(self.A.shape_in, np.float32)), self.drr(matrix)[0]
-
-
 def test_spawned_workers_of_a_loader_hold_projectors(make):
     torch = pytest.importorskip("torch")
     from mphdrr.core.diffdrr import DRR
 
-    images = Images(make("default"), DRR(torch.ones(8, 8, 8), GRID.affine, sdd=800.0, height=5, delx=2.0))
+    pose = torch.eye(4, dtype=torch.float64)
+    pose[2, 3] = -100.0
+    A = make("default")
+    drr = DRR(torch.ones(8, 8, 8), GRID.affine, sdd=800.0, height=5, delx=2.0)
     spawn = multiprocessing.get_context("spawn")
-    loader = torch.utils.data.DataLoader(images, batch_size=None, num_workers=1, multiprocessing_context=spawn)
-    for found, expected in zip(loader, (images[0], images[1]), strict=True):
-        assert all(torch.equal(x, torch.as_tensor(y)) for x, y in zip(found, expected, strict=True))
+    for module, inputs in ((A, [torch.full(A.shape_in, 2.0), torch.ones(A.shape_in)]), (drr, [pose, pose / 2])):
+        options = {"collate_fn": module, "num_workers": 1, "multiprocessing_context": spawn}
+        images = torch.utils.data.DataLoader(inputs, batch_size=None, **options)
+        for image, x in zip(images, inputs, strict=True):
+            assert torch.equal(image, module(x))
 
 
 def images_and_gradients(module, *inputs):

@@ -47,18 +47,14 @@ def write(volume: Volume, path: Path, template: AnyPath | None = None, tags: Map
     Tags of patient, study and series are those of the DICOM file `template`, with the values of `tags`, by keyword.
     """
     if volume.quantity not in (*_TOMOGRAMS, "hu"):
-        raise InputError(
-            f"DICOM files hold {', '.join(_TOMOGRAMS)} or hu, not {volume.quantity}: choose another format"
-        )
+        raise InputError(f"DICOM holds {', '.join(_TOMOGRAMS)} or hu, not {volume.quantity}: choose another format")
     affine, array = RAS_FROM_LPS @ volume.grid.affine, volume.array
     spacing = volume.grid.spacing
     axes = affine[:3, :3] / spacing
     if np.abs(axes.T @ axes - np.eye(3)).max() > _RIGHT_ANGLE:
         raise InputError("its grid is sheared, DICOM's have axes at right angles: resample it to one of these")
     position = affine[:3, 3]
-    if (
-        np.linalg.det(axes) < 0
-    ):  # the slices are written from the last to the first, along the normal of rows and columns
+    if np.linalg.det(axes) < 0:  # write the last slice first, along the normal of rows and columns
         position = position + (array.shape[2] - 1) * affine[:3, 2]
         axes, array = axes * [1, 1, -1], array[:, :, ::-1]
     kind, factor, code, meaning = _TOMOGRAMS.get(volume.quantity, ("AXIAL", 1.0, "HU", ""))
@@ -73,10 +69,6 @@ def write(volume: Volume, path: Path, template: AnyPath | None = None, tags: Map
             for k, (pixels, place) in enumerate(zip(stored, places, strict=True), 1):
                 save(tagged(header, **place), k, pixels, folder / f"{k:04d}.dcm")
         return
-    if volume.quantity not in _TOMOGRAMS:
-        raise InputError(
-            f"DICOM files hold {', '.join(_TOMOGRAMS)} or hu, not {volume.quantity}: choose another format"
-        )
     detector = tagged(None, CollimatorType="UNKN", FocalDistance=None, **places[0])
     tagged(
         header, ImageType=["DERIVED", "PRIMARY", "RECON TOMO", kind], NumberOfFrames=len(stored),

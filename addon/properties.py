@@ -72,9 +72,7 @@ class ModuleProperties(bpy.types.PropertyGroup):
     added: BoolProperty(name="Added", description="The module is not in the workbook", options={"HIDDEN"})
     length_mode: EnumProperty(name="Length", description="Origin of the collimator's length l", items=_LENGTH_MODES,
                               default="TYPED", update=on_edit("module"))  # fmt: skip
-    exact: StringProperty(
-        name="Exact Values", description="Numbers and pose as imported, float64 JSON", options={"HIDDEN"}
-    )
+    exact: StringProperty(name="Exact Values", description="Numbers and pose as imported, JSON", options={"HIDDEN"})
     placed: FloatVectorProperty(name="Placed", description="Position when last built, mm", size=3, options={"HIDDEN"})
     built: StringProperty(name="Built", description="Values behind the readouts", options={"HIDDEN"})
     # Readouts, which `following.py` writes and the panels show.
@@ -103,9 +101,7 @@ class ScannerProperties(bpy.types.PropertyGroup):
     workbook: path_property("Workbook", "Workbook that was last read or written")
     sha256: StringProperty(name="SHA-256", description="Checksum of the workbook when it was read")
     n_modules: IntProperty(name="Modules", description="Number of modules when the scanner was imported", min=0)
-    quick_ranges: StringProperty(
-        name="Quick Ranges", description="Module ranges with a button, JSON", options={"HIDDEN"}
-    )
+    quick_ranges: StringProperty(name="Ranges", description="Module ranges with a button, JSON", options={"HIDDEN"})
     source: StringProperty(name="Source", description="Workbook that the numbers come from, JSON", options={"HIDDEN"})
     plate_thickness: FloatProperty(
         name="Plate", description="Thickness of the aperture plates in mm", min=0.0, update=on_edit("scanner")
@@ -137,7 +133,7 @@ class ScannerProperties(bpy.types.PropertyGroup):
     keep_aimed: BoolProperty(
         name="Keep Aimed",
         description="Turn a module that is moved so that it keeps looking at the isocentre. One that is only turned "
-        "stays turned: it is tilted",
+        "stays turned: it is tilted. What an animation, a constraint or a deformed parent moves keeps its direction",
         default=True, update=on_edit("scanner"),
     )  # fmt: skip
     # The modules' properties have the first module's values here. `mixed` names those that differ between modules.
@@ -151,31 +147,21 @@ class ScannerProperties(bpy.types.PropertyGroup):
     sensitivity: FloatProperty(name="Sensitivity", description="Sensitivity of all modules at the isocentre, cps/MBq")
     resolution: FloatProperty(name="Resolution", description="Mean FWHM in mm of the modules at the isocentre")
     n_covering: IntProperty(name="Covering", description="Number of modules that see their whole ROI sphere")
-    parts_free: BoolProperty(
-        name="Parts Free", description="Parts may be grabbed; version 0.1.0 locked them", options={"HIDDEN"}
-    )
+    parts_free: BoolProperty(name="Free", description="Parts may be grabbed; 0.1.0 locked them", options={"HIDDEN"})
     untidy: StringProperty(name="Untidy", description="Copied cameras and parts without a camera, in words")
     findings: StringProperty(name="Findings", description="Findings of the last geometry check, JSON")
     design: StringProperty(name="Design", description="Result of the last design, lines as JSON")
     calibration: StringProperty(name="Calibration", description="Result of the last calibration, lines as JSON")
 
 
-def _is_scanner(self: GeometryProperties, collection: bpy.types.Collection) -> bool:
-    """Return whether a collection can be chosen as the scanner."""
-    return collection.mphdrr_scanner.is_scanner
-
-
 class GeometryProperties(bpy.types.PropertyGroup):
     """State of the Geometry panel; `Scene.mphdrr_geometry`."""
 
     scanner: PointerProperty(name="Scanner", description="Scanner that the panels work on: the active object's",
-                             type=bpy.types.Collection, poll=_is_scanner, update=on_edit("scanner_chosen"))  # fmt: skip
-    active_index: IntProperty(
-        name="Active Module", description="Index among the scanner's objects", update=on_edit("active_module")
-    )
-    all_at_once: BoolProperty(
-        name="All Modules", description="Show and change all modules at once, not the active one alone"
-    )
+                             type=bpy.types.Collection, poll=lambda self, item: item.mphdrr_scanner.is_scanner,
+                             update=on_edit("scanner_chosen"))  # fmt: skip
+    active_index: IntProperty(name="Active Module", description="Index in the list", update=on_edit("active_module"))
+    all_at_once: BoolProperty(name="All Modules", description="Show and change all modules, not the active one alone")
     first: IntProperty(name="First", description="First module number of the range", default=1)
     last: IntProperty(name="Last", description="Last module number of the range", default=40)
     # Lines that `sight_lines.py` draws in the 3D views.

@@ -2,6 +2,7 @@
 
 import atexit
 import importlib
+import inspect
 import pkgutil
 from collections.abc import Callable
 from contextlib import ExitStack
@@ -173,6 +174,7 @@ UPDATES: dict[str, Callable[..., None]] = {
     "modules_removed": _modules_removed,
 }
 
+_OVERRIDABLE = {"LIBRARY_OVERRIDABLE"}
 _registered = ExitStack()  # undoes the registration, in reverse order
 
 
@@ -186,7 +188,7 @@ def register(command: Callable[..., int] | None = None) -> None:
             bpy.utils.register_class(cls)
             _registered.callback(bpy.utils.unregister_class, cls)
         for owner, name, group in properties.POINTERS:
-            setattr(owner, name, bpy.props.PointerProperty(type=group))
+            setattr(owner, name, bpy.props.PointerProperty(type=group, override=_OVERRIDABLE))
             _registered.callback(delattr, owner, name)
         preferences.apply()
         for menu, draw in MENUS:
@@ -219,13 +221,21 @@ def register(command: Callable[..., int] | None = None) -> None:
 
 
 def _complete(cls: Any) -> None:
-    """Give a class the label, idname and tooltip that follow from its name and docstring, unless it has its own."""
+    """Give a class the label, idname and tooltip that follow from its name and docstring, unless it has its own.
+
+    Library overrides keep the properties of a property group.
+    """
     if cls.__name__.startswith("MPHDRR_"):
         cls.bl_label = getattr(cls, "bl_label", ids.label(cls.__name__))
     if issubclass(cls, bpy.types.Operator):
         cls.bl_idname = vars(cls).get("bl_idname", ids.operator_name(cls.__name__))
     if issubclass(cls, (bpy.types.Operator, bpy.types.Panel)) and cls.__doc__ is not None:
         cls.bl_description = " ".join(cls.__doc__.split()).removesuffix(".")  # Blender keeps line breaks
+    for base in cls.__mro__ if issubclass(cls, bpy.types.PropertyGroup) else ():
+        if annotations := inspect.get_annotations(base, eval_str=True):
+            for annotation in annotations.values():
+                getattr(annotation, "keywords", {}).setdefault("override", _OVERRIDABLE)
+            base.__annotations__ = annotations
 
 
 def unregister() -> None:

@@ -177,8 +177,7 @@ def _filled_ranges(volumes: tuple[Array, ...]) -> list[tuple[int, int]]:
     for axis in (0, 1):
         slabs = [np.moveaxis(volume, axis, 0) for volume in volumes]
         indices = range(len(slabs[0]))
-        first = next((i for i in indices if any(slab[i].any() for slab in slabs)), None)
-        if first is None:
+        if (first := next((i for i in indices if any(slab[i].any() for slab in slabs)), None)) is None:
             return [(0, 1)] * 3
         last = next(i for i in reversed(indices) if any(slab[i].any() for slab in slabs))
         ranges.append((first, last + 1))

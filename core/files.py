@@ -131,8 +131,7 @@ def is_leftover(path: Path) -> bool:
     """
     import psutil
 
-    match = _TEMPORARY.fullmatch(path.name)
-    if match is None or not match[1]:  # earlier versions named no process
+    if (match := _TEMPORARY.fullmatch(path.name)) is None or not match[1]:  # earlier versions named no process
         return match is not None
     if int(match[1], 16) == _HOST:
         try:

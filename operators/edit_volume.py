@@ -80,8 +80,7 @@ class MPHDRR_OT_clean_volume_files(Reported, bpy.types.Operator):
     bl_options = {"REGISTER"}
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
-        unused = storage.unused_volumes()
-        if not unused:
+        if not (unused := storage.unused_volumes()):
             return self.execute(context)
         message = "Neither Undo nor other .blend files that use this folder will find them again."
         return ask_to_remove(self, context, event, f"Remove {storage.summarize_unused(unused)}?", message)
@@ -130,9 +129,7 @@ class MPHDRR_OT_remake_volumes(jobs.JobOperator, bpy.types.Operator):
 
     bl_label = "Make Missing Volumes Again"
 
-    poll = needs(
-        (lambda context: recovery.missing_volumes(context.scene)[0], "No phantom or map misses its file of voxels")
-    )
+    poll = needs((lambda context: recovery.missing_volumes(context.scene)[0], "No phantom or map misses its file"))
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
         return recovery.remake_job(context.scene)

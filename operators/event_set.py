@@ -37,9 +37,8 @@ class MPHDRR_OT_try_event(jobs.JobOperator, bpy.types.Operator):
     folder: event_properties.FOLDER
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
-        return event_sets.try_event_job(
-            context, *self.setting_values(context.scene.mphdrr_events, "recipe", "number", "folder")
-        )
+        values = self.setting_values(context.scene.mphdrr_events, "recipe", "number", "folder")
+        return event_sets.try_event_job(context, *values)
 
 
 class MPHDRR_OT_make_event_set(jobs.JobOperator, bpy.types.Operator):
@@ -65,6 +64,5 @@ class MPHDRR_OT_open_event(jobs.JobOperator, bpy.types.Operator):
     model: event_properties.MODEL
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
-        return event_sets.open_event_job(
-            context, *self.setting_values(context.scene.mphdrr_events, "folder", "opened", "model")
-        )
+        values = self.setting_values(context.scene.mphdrr_events, "folder", "opened", "model")
+        return event_sets.open_event_job(context, *values)

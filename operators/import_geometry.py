@@ -51,7 +51,7 @@ class MPHDRR_OT_import_geometry(bpy.types.Operator):
         options={"SKIP_SAVE"},
     )
     chosen_columns: StringProperty(
-        name="Chosen Columns", description="Column map of the dialog, TOML", options={"HIDDEN", "SKIP_SAVE"}
+        name="Columns", description="The dialog's map, TOML", options={"HIDDEN", "SKIP_SAVE"}
     )
     plate_thickness: FloatProperty(name="Plate (mm)",
                                    description="Thickness in mm of the aperture plate that holds the pinhole",
@@ -79,9 +79,8 @@ class MPHDRR_OT_import_geometry(bpy.types.Operator):
                 self.chosen_columns = column_maps.accept(form).to_toml()
             elif self.choose_columns and not self.chosen_columns:
                 if not self._has_window():  # a script cannot answer
-                    raise InputError(
-                        "choose_columns opens a dialog: in a script set columns to a column map (.toml) instead"
-                    )
+                    advice = "in a script set columns to a column map (.toml) instead"
+                    raise InputError(f"choose_columns opens a dialog: {advice}")
                 column_maps.fill(form, self._workbook(), self._columns())
                 return self._ask_columns(context)
             with reports.warnings_reported(self):
@@ -178,6 +177,5 @@ class MPHDRR_OT_import_geometry(bpy.types.Operator):
     def _ask_columns(self, context: bpy.types.Context) -> set[str]:
         """Open the column map dialog."""
         self._dialog = "COLUMNS"
-        return context.window_manager.invoke_props_dialog(
-            self, width=column_map_dialog.WIDTH, title=f"Columns of {self._workbook().name}", confirm_text="Import"
-        )
+        texts = {"title": f"Columns of {self._workbook().name}", "confirm_text": "Import"}
+        return context.window_manager.invoke_props_dialog(self, width=column_map_dialog.WIDTH, **texts)

@@ -32,9 +32,7 @@ class ReadVolumes(jobs.JobOperator):
         description="Move the volume's middle to the world's origin; leave it off for volumes that belong together",
         default=True,
     )
-    attenuation: BoolProperty(
-        name="CT to Attenuation", description="Convert CT numbers (HU) to attenuation coefficients (1/mm)"
-    )
+    attenuation: BoolProperty(name="CT to Attenuation", description="Convert CT numbers (HU) to attenuation (1/mm)")
     energy: FloatProperty(name="Energy (keV)", description="Energy of the photons in keV: 140.5 for Tc-99m",
                           default=140.5, min=10.0, max=1000.0)  # fmt: skip
     grid: StringProperty(name="Grid", description="Grid of an OpenVDB file that holds several", options={"SKIP_SAVE"})

@@ -113,8 +113,7 @@ class MPHDRR_OT_pick_window(eyedropper.Eyedropper, bpy.types.Operator):
 
     def target_under(self, context: bpy.types.Context, event: bpy.types.Event) -> tuple[str, float] | None:
         """Return the description and the exact value of the number under the mouse, or None."""
-        mouse = eyedropper.region_under(context, event)
-        if mouse is None or mouse[0].type != "IMAGE_EDITOR":
+        if (mouse := eyedropper.region_under(context, event)) is None or mouse[0].type != "IMAGE_EDITOR":
             return None
         area, region, place = mouse
         return tiles.value_at(area.spaces.active.image, *region.view2d.region_to_view(*place))

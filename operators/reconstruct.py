@@ -24,8 +24,7 @@ class MPHDRR_OT_reconstruct(reconstruction_properties.ReconstructionSettings, jo
 
     def ask(self, context: bpy.types.Context) -> set[str] | None:
         """Choose a method that suits the run when the button is pressed; ask nothing."""
-        are_counts = runs.holds_counts(context.scene)
-        if are_counts is not None:
+        if (are_counts := runs.holds_counts(context.scene)) is not None:
             reconstruction_properties.fit_method(context.scene.mphdrr_reconstruction, are_counts)
         return super().ask(context)
 

@@ -107,8 +107,7 @@ class MPHDRR_OT_compare_runs(jobs.JobOperator, bpy.types.Operator):
     other: EnumProperty(name="Other", description="Run to subtract", items=_other_runs, options={"SKIP_SAVE"})
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
-        minuend = runs.shown_run(context.scene)
-        if minuend is None or not self.other:
+        if (minuend := runs.shown_run(context.scene)) is None or not self.other:
             raise InputError("there is no other run to compare with: keep the shown one and render again")
         subtrahend = _required_run(context.scene, int(self.other))
         paths = [rendering.run_file_path(item.file) for item in (minuend, subtrahend)]

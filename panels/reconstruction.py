@@ -23,8 +23,7 @@ class MPHDRR_PT_reconstruction(Folded, bpy.types.Panel):
     def draw(self, context: bpy.types.Context) -> None:
         layout = layouts.labelled(self.layout)
         settings = context.scene.mphdrr_reconstruction
-        run = runs.shown_run(context.scene)
-        if run is not None:  # the scene may have changed since poll
+        if (run := runs.shown_run(context.scene)) is not None:  # the scene may have changed since poll
             layout.label(text=iface("Of {run}").format(run=run.name), translate=False, icon="RENDER_STILL")
         main = layout.column(align=True)
         main_settings = (setting for setting in panel_properties(settings) if setting[0] in _MAIN)

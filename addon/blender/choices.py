@@ -44,6 +44,4 @@ _MASK = 0xFFFFFF
 
 def items(numbers: Mapping[str, int], rows: Iterable[tuple[str, str, str]]) -> Items:
     """Return items (identifier, label, description, number); numbers come from a table above, else from a checksum."""
-    return tuple(
-        (name, label, text, numbers.get(name, zlib.crc32(name.encode()) & _MASK)) for name, label, text in rows
-    )
+    return tuple((name, label, tip, numbers.get(name, zlib.crc32(name.encode()) & _MASK)) for name, label, tip in rows)

@@ -38,8 +38,7 @@ class Eyedropper:
         if event.type in {"ESC", "RIGHTMOUSE"}:
             return self._end(context, "CANCELLED")
         if event.type == "LEFTMOUSE" and event.value == "PRESS":
-            target = self.target_under(context, event)
-            if target is None:
+            if (target := self.target_under(context, event)) is None:
                 self.report({"WARNING"}, f"Click on {self.target_words}, or press Esc")
             elif self.pick(context, target):
                 return self._end(context, "FINISHED")

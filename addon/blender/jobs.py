@@ -82,8 +82,7 @@ def _finishing(job: Job, result: Any) -> Finishing:
 
 def require_scene(uid: int, purpose: str) -> bpy.types.Scene:
     """Return the scene with this `session_uid`; `InputError` where it is gone, with `purpose` such as "the design is"."""
-    scene = find_by_uid(bpy.data.scenes, uid)
-    if scene is None:
+    if (scene := find_by_uid(bpy.data.scenes, uid)) is None:
         raise InputError(f"the scene that {purpose} for is gone")
     return scene
 
@@ -194,9 +193,7 @@ class JobOperator:
 
     bl_options = {"REGISTER", "UNDO"}
 
-    confirmed: BoolProperty(
-        name="Confirmed", description="Start without asking", options={"HIDDEN", "SKIP_SAVE"}, default=False
-    )
+    confirmed: BoolProperty(name="Confirmed", description="Start without asking", options={"HIDDEN", "SKIP_SAVE"})
 
     asks_for = ""
     """The property that the user sets in a file browser, unless it is set already, as by dropping a file on the window."""

@@ -5,31 +5,80 @@ from typing import Any
 
 import bpy
 import numpy as np
-from mathutils import Matrix
+from mathutils import Euler, Matrix
 from numpy.typing import NDArray
+
+from ...core.errors import InputError
+from . import decimals
+
+_ROUNDING = 4e-7  # relative rounding of an element of the product of two float32 matrices
 
 
 def world_matrix(item: bpy.types.Object) -> NDArray[np.float64]:
-    """Return the current world matrix (4, 4) of an object in float64.
+    """Return the current world matrix (4, 4) of an object in float64, its translation in the decimals that were typed.
 
     `Object.matrix_world` is out of date after a script has set a location, and while the object is hidden: it is used
-    only for objects with constraints or a parent that is not a plain object.
+    only for objects with constraints or physics.
     """
-    if any(not c.mute for c in item.constraints):
-        return np.array(item.matrix_world, dtype=np.float64)
-    return _parent_matrix(item) @ np.array(item.matrix_basis, dtype=np.float64)
+    if any(not c.mute for c in item.constraints) or item.rigid_body is not None:
+        return _as_typed(item.matrix_world)
+    if item.parent is None and not any(item.delta_location):
+        return _as_typed(item.matrix_basis)
+    own = np.array(item.matrix_basis, dtype=np.float64)
+    own[:3, 3] = [
+        decimals.typed(x) + decimals.typed(delta) for x, delta in zip(item.location, item.delta_location, strict=True)
+    ]
+    return _as_typed(_parent_matrix(item) @ own)
+
+
+def _as_typed(matrix: Any) -> NDArray[np.float64]:
+    """Return a matrix (4, 4) in float64 whose translation has the shortest decimals of Blender's float32 numbers."""
+    values = np.array(matrix, dtype=np.float64)
+    values[:3, 3] = [decimals.typed(x) for x in values[:3, 3]]
+    return values
 
 
 def _parent_matrix(item: bpy.types.Object) -> NDArray[np.float64]:
     """Return the matrix (4, 4), in float64, that leads from an object's own transform to the world."""
-    parent = item.parent
-    if parent is None:
+    if item.parent is None:
         return np.eye(4)
-    if item.parent_type != "OBJECT" or (parent.type == "CURVE" and parent.data.use_path):  # as Blender has evaluated it
-        return np.array(item.matrix_world, dtype=np.float64) @ np.linalg.inv(
-            np.array(item.matrix_basis, dtype=np.float64)
-        )
-    return world_matrix(parent) @ np.array(item.matrix_parent_inverse, dtype=np.float64)
+    if _is_deformed_with_parent(item):  # as Blender has evaluated the parent; the object itself may be out of date
+        evaluated = item.evaluated_get(bpy.context.view_layer.depsgraph or bpy.context.evaluated_depsgraph_get())
+        is_evaluated = evaluated.is_evaluated  # else it is hidden
+        local = evaluated.matrix_local if is_evaluated else item.matrix_parent_inverse @ item.matrix_basis
+        parent = np.array(evaluated.matrix_world, np.float64) @ np.linalg.inv(np.array(local, np.float64))
+    else:
+        parent = world_matrix(item.parent)
+    inverse = _as_typed(item.matrix_parent_inverse)
+    matrix = parent @ inverse
+    # Right angles, and parents whose inverse keeps an object in its place, are exact apart from float32 rounding.
+    rounding = _ROUNDING * (np.abs(parent) @ np.abs(inverse) + np.linalg.norm(matrix[:3], axis=0))
+    return np.where(np.abs(matrix - np.rint(matrix)) <= rounding, np.rint(matrix), matrix)
+
+
+def _is_deformed_with_parent(item: bpy.types.Object) -> bool:
+    """Return whether an object follows a bone, vertices, a lattice or a curve's path, not its parent's own transform."""
+    return item.parent_type != "OBJECT" or (item.parent.type == "CURVE" and item.parent.data.use_path)
+
+
+def is_free(item: bpy.types.Object) -> bool:
+    """Return whether only the user moves an object: no animation, driver, constraint or physics does."""
+    data = item.animation_data
+    is_animated = data is not None and (data.action is not None or len(data.drivers) or len(data.nla_tracks))
+    return not is_animated and not len(item.constraints) and item.rigid_body is None
+
+
+def is_moved_by_hand(item: bpy.types.Object) -> bool:
+    """Return whether an object `is_free`, and is carried by nothing but free parents as a whole."""
+    is_carried = item.parent is not None and (_is_deformed_with_parent(item) or not is_moved_by_hand(item.parent))
+    return is_free(item) and not is_carried
+
+
+def require_evaluated(items: Iterable[bpy.types.Object]) -> None:
+    """Bring objects up to date that are not moved by hand; raise `InputError` where Blender leaves one out as hidden."""
+    for item in [item for item in items if not is_moved_by_hand(item)]:
+        if not item.evaluated_get(bpy.context.evaluated_depsgraph_get()).is_evaluated:
+            raise InputError(f"{item.name!r} is hidden, so Blender does not evaluate what moves it: show it first")
 
 
 def world_matrices(items: Sequence[bpy.types.Object]) -> NDArray[np.float64]:
@@ -37,13 +86,26 @@ def world_matrices(items: Sequence[bpy.types.Object]) -> NDArray[np.float64]:
     return np.array([world_matrix(item) for item in items]).reshape(-1, 4, 4)
 
 
-def set_world_matrix(item: bpy.types.Object, matrix: NDArray[np.float64]) -> None:
-    """Move an object to a world matrix (4, 4), under whatever parent it has."""
+def set_world_matrix(item: bpy.types.Object, matrix: NDArray[np.float64], unchanged: Sequence[str] = ()) -> None:
+    """Move an object to a world matrix (4, 4), under whatever parent it has, but for `unchanged`: "location", "scale"."""
+    values = {name: getattr(item, name).copy() for name in unchanged}
     if item.parent is not None:
         matrix = np.linalg.inv(_parent_matrix(item)) @ matrix
+    if "scale" in unchanged and np.linalg.det(matrix) < 0:  # under a mirrored parent
+        matrix = matrix * [-1.0, 1.0, 1.0, 1.0]
     item.matrix_basis = Matrix(matrix)
     if item.parent is None and item.rotation_mode == "XYZ":
-        item.rotation_euler = euler_angles(matrix)
+        angles = Euler(euler_angles(matrix))
+        # The angles of a scaled, mirrored or doubly rotated (`delta_rotation_euler`) object are not those of its matrix.
+        if np.allclose(angles.to_matrix(), item.rotation_euler.to_matrix(), rtol=0, atol=1e-5):
+            item.rotation_euler = angles
+    for name, value in values.items():
+        setattr(item, name, value)
+
+
+def mirror_signs(item: bpy.types.Object) -> list[float]:
+    """Return the signs of an object's own scale along x, y and z, and 1."""
+    return [*(-1.0 if x * delta < 0 else 1.0 for x, delta in zip(item.scale, item.delta_scale, strict=True)), 1.0]
 
 
 def unparent(item: bpy.types.Object) -> None:

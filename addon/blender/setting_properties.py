@@ -54,8 +54,7 @@ def make_properties(settings: Settings) -> dict[str, Any]:
             limits = {"min": 0 if setting.default is None else least, "max": setting.most, "soft_max": setting.slider}
             limits["precision"] = 3 if setting.kind is float else None
             common |= {key: value for key, value in limits.items() if value is not None}
-        material = material_property(name, setting)
-        if material is not None:
+        if (material := material_property(name, setting)) is not None:
             no_material = ("NUMBER", "By Coefficient", f"By its attenuation coefficient{absent}")
             result[material] = _enumeration(material, setting, no_material)
             common["name"] = f"µ ({setting.unit})"  # below the material's menu
@@ -168,8 +167,7 @@ def properties_to_draw(
         unmet = [need for need in setting.needs if not is_met(values, need, SETTINGS)]
         if any(map(is_hidden, unmet)):
             continue
-        material = material_property(name, setting)
-        if material is not None:
+        if (material := material_property(name, setting)) is not None:
             yield material, not unmet
         if material is None or getattr(owner, material) == "NUMBER":
             yield name, not unmet

@@ -7,11 +7,13 @@ preferences say that they are shared. Packing a .blend does not include volumes.
 
 import filecmp
 import functools
+import glob
 import os
 import re
 import shutil
 import time
 from collections.abc import Callable, Iterable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -23,9 +25,8 @@ from ...core.files import ensure_folder, replacing
 from ...core.memory import readable_size
 from . import ids
 
-_OUR_VOLUME = re.compile(r"[a-z]+-[0-9a-f]{16}(\.preview)?(_\d{4})?\.(vdb|h5)")
-"""Names of the files that `stored_volumes` writes, made from their content."""
-_OUR_RUN = re.compile(r".*-projections-[0-9a-f]{8}\.h5")  # names of run files
+_OURS = re.compile(r"([a-z_]+-[0-9a-f]{16}|.*-projections-[0-9a-f]{8})(\.preview)?(_\d{4})?\.(vdb|h5)")
+"""Names of files that `stored_volumes` writes, made from their content, and of run files; all of a result begin alike."""
 _ENDING = re.compile(r"\.[A-Za-z]\w*$")  # a file's ending; a folder, or a number typed in place of a file, has none
 _FRAME = re.compile(r"_\d{4}\.vdb$")  # the frame number at the end of the names of a sequence's files
 
@@ -50,6 +51,10 @@ class _ChangedPath(NamedTuple):
 
 
 _changed_paths: list[_ChangedPath] = []  # paths changed by the save that is going on
+_saved_folder = Path()  # folder of the .blend, or the temporary one, before the save that is going on
+_saved_names: set[str] | None = None  # names of our files that the .blend as last saved needs; None: not known
+_left_folders: dict[Path, set[str] | None] = {}
+"""Folders that a Save As has left, with the `_saved_names` of their .blend."""
 _save_note = (0.0, "")  # the time of the last save, s, and the line about it
 
 
@@ -105,7 +110,7 @@ def _cached_size(path: Path, interval: float) -> int | None:
 
 def missing_volumes() -> list[bpy.types.Volume]:
     """Return our volumes that miss a file, the shown one or the one with every voxel."""
-    our_volumes = [data for data in bpy.data.volumes if _OUR_VOLUME.fullmatch(absolute(data.filepath).name)]
+    our_volumes = [data for data in bpy.data.volumes if _OURS.fullmatch(absolute(data.filepath).name)]
     return [data for data in our_volumes if any(file_size(path) is None for path in _files_of(data))]
 
 
@@ -146,10 +151,52 @@ def _file_name(path: str | Path) -> str:
 
 def unused_volumes() -> list[Path]:
     """Return the voxel files and run files in this .blend's folder that none of its volumes and lists of runs needs."""
-    used_names = {path.name for data in bpy.data.volumes for path in _files_and_resume_files(data)}
-    used_names |= {absolute(run.file).name for scene in bpy.data.scenes for run in scene.mphdrr_projections.runs}
-    our_files = [p for p in _folder().glob("*") if _OUR_VOLUME.fullmatch(p.name) or _OUR_RUN.fullmatch(p.name)]
-    return sorted(path for path in our_files if path.is_file() and path.name not in used_names)
+    used_names = _used_names()
+    our_files = [path for path in _folder().glob("*") if _OURS.fullmatch(path.name) and path.is_file()]
+    return sorted(path for path in our_files if path.name not in used_names)
+
+
+def _used_names() -> set[str]:
+    """Return the names of the files that the volumes and the lists of runs need."""
+    names = {path.name for data in bpy.data.volumes for path in _files_and_resume_files(data)}
+    return names | {absolute(run.file).name for scene in bpy.data.scenes for run in scene.mphdrr_projections.runs}
+
+
+def adopt(path: Path) -> Path:
+    """Return the path in this .blend's folder of a file made by a job, in the folder that the .blend had when it began.
+
+    After a Save As in the meantime, all files of the result move there; those that the other .blend needs are copied.
+    """
+    match = _OURS.fullmatch(path.name)
+    if match is None or path.parent == _folder() or path.parent not in _left_folders:
+        return path
+    for file in list(path.parent.glob(f"{glob.escape(match[1])}*")):
+        _copy_into(file, _folder())
+        _remove_left(file)
+    return _folder() / path.name
+
+
+def remove_results(paths: Iterable[Path]) -> None:
+    """Remove files made by a job that nothing needs, wherever they have moved."""
+    unused = set(unused_volumes())
+    for path in paths:
+        _remove_left(path)
+        for file in unused & {path, _folder() / path.name}:
+            file.unlink(missing_ok=True)
+
+
+def _remove_left(path: Path) -> None:
+    """Remove a file from a folder that a Save As has left, unless the folder's .blend needs it."""
+    saved_names = _left_folders.get(path.parent)
+    if saved_names is not None and path.name not in saved_names:
+        path.unlink(missing_ok=True)
+        _remove_empty(path.parent)
+
+
+def _remove_empty(path: Path) -> None:
+    """Remove a folder if it is empty: jobs make it again."""
+    with suppress(OSError):
+        path.rmdir()
 
 
 def remove_unused() -> str:
@@ -295,10 +342,11 @@ def collect_files() -> str:
 
 def before_save(filepath: str, _: Any = None) -> None:
     """Copy files from the temporary folder, for a Save As also those of the old .blend, and make paths lead to them."""
-    global _save_note
+    global _save_note, _saved_folder
     _changed_paths.clear()
     if not filepath:
         return
+    _saved_folder = _folder()
     is_new = filepath != bpy.data.filepath
 
     def is_wanted(name: str, path: Path) -> bool:
@@ -321,14 +369,21 @@ def draw_save_note(header: bpy.types.Header, context: bpy.types.Context) -> None
 
 
 def after_save(filepath: str, _: Any = None) -> None:
-    """Restore paths after "Save Copy", when this session still belongs to another file or to none."""
+    """Restore paths after "Save Copy", when this session still belongs to another file; after Save As, leave that file."""
+    global _saved_names
     if not filepath or bpy.data.filepath != filepath:
         restore_paths()
+        return
     for change in _changed_paths:
         # `//` may not have led there yet when the path was set, so Blender could not read the voxels: set it again.
         if change.owner == change.owner.id_data:
             setattr(change.owner, change.name, _relative_path(Path(filepath).parent, change.path))
     _changed_paths.clear()
+    if _saved_folder != _folder():
+        _left_folders[_saved_folder] = _saved_names
+        _remove_empty(_saved_folder)
+    _left_folders.pop(_folder(), None)
+    _saved_names = _used_names()
 
 
 def restore_paths(*_: Any) -> None:
@@ -340,7 +395,10 @@ def restore_paths(*_: Any) -> None:
 
 def after_load(*_: Any) -> None:
     """Relink missing files that lie in the folder of a .blend which was renamed together with it."""
+    global _saved_names
     _relink(_folder().glob("*") if bpy.data.filepath else ())
+    _left_folders.clear()
+    _saved_names = _used_names()
 
 
 def _relative_path(folder: Path, path: Path) -> str:
@@ -358,7 +416,7 @@ def _is_too_large(file: Path, size: int, target: Path) -> bool:
 
 def _copy_into(file: Path, target: Path) -> Path:
     """Copy a file into a folder, under a new name if a different file has its name, and return the copy's path."""
-    is_ours = _OUR_VOLUME.fullmatch(file.name) or _OUR_RUN.fullmatch(file.name)
+    is_ours = _OURS.fullmatch(file.name)
     path, number = ensure_folder(target) / file.name, 2
     while path.exists():
         if is_ours or filecmp.cmp(file, path, shallow=False):

@@ -166,8 +166,7 @@ class FigureScene:
         """Add the volume's object, with a copy of its surface if it has one."""
         self.volume_objects = [self.add_object(item.data)]
         self.volume_objects[0].matrix_world = item.matrix_world
-        surface = looks.surface_of(item)
-        if surface is not None:  # its look draws a surface instead of smoke
+        if (surface := looks.surface_of(item)) is not None:  # its look draws a surface instead of smoke
             copy = surface.copy()
             copy.data, copy.parent = surface.data.copy(), None
             self.scene.collection.objects.link(copy)

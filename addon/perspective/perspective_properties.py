@@ -51,9 +51,7 @@ def _set_along(settings: bpy.types.PropertyGroup, value: float) -> None:
 class EpipolarProperties(bpy.types.PropertyGroup):
     """Pixel of the shown run, and a marker on its ray."""
 
-    views: StringProperty(
-        name="Views", description="Views in which the pixel was picked; empty: none is picked", options={"HIDDEN"}
-    )
+    views: StringProperty(name="Views", description="Views with a picked pixel; empty: none", options={"HIDDEN"})
     module: IntProperty(name="Module", description="Number of the pixel's module", update=on_edit("epipolar"))
     column: FloatProperty(name="Column",
                           description="Column of the pixel as in the arrays, along +u; 0: the centre of pixel 0",

@@ -311,9 +311,7 @@ class VolumeProperties(bpy.types.PropertyGroup):
     )
     look: EnumProperty(name="Look", description="How the volume is drawn", items=choices.items({}, LOOKS),
                        default="DENSITY", update=on_edit("look"))  # fmt: skip
-    surface: FloatProperty(
-        name="Surface", description="Value at which the surface is drawn", update=on_edit("display_range")
-    )
+    surface: FloatProperty(name="Surface", description="Value of the drawn surface", update=on_edit("display_range"))
     slices: IntVectorProperty(name="Slices", description="Voxel of each slice", size=3, min=0, update=on_edit("slices"))
     # Name of the file that the voxels were first stored in: it identifies them in every version of Blender.
     content: StringProperty(options={"HIDDEN"})

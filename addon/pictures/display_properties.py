@@ -32,9 +32,7 @@ class DisplayProperties(bpy.types.PropertyGroup):
     automatic: BoolProperty(name="Automatic",
                             description="Show the numbers from 0, or from the smallest, to the largest", default=True,
                             update=updates.on_edit("display"))  # fmt: skip
-    low: FloatProperty(
-        name="Low", description="Number with the first colour", default=0.0, update=updates.on_edit("display")
-    )
+    low: FloatProperty(name="Low", description="Number with the first colour", update=updates.on_edit("display"))
     high: FloatProperty(
         name="High", description="Number with the last colour", default=1.0, update=updates.on_edit("display")
     )

@@ -108,8 +108,7 @@ def _make_job(
     readers, panel_mu = _mu_readers(scene), scene.mphdrr_reconstruction.mu
     mu_name = panel_mu.name if panel_mu in volumes.volume_objects(scene) else None
     uid, start = scene.session_uid, time.perf_counter()
-    has_window = windows.has_window()
-    if has_window:
+    if has_window := windows.has_window():
         images.open_editor(context)
     live = _LiveResult(context, f"{name} {method.label}", previous)
 
@@ -162,7 +161,7 @@ def _make_job(
         volumes.make_active(bpy.context, item)
         slices.add_slices(item, full_slices(reconstruction.volume.array).tolist())
         images.show_below(bpy.data.images[ids.RECONSTRUCTION], bpy.context)
-        live.tidy()
+        storage.remove_results(live.files)
         seconds = time.perf_counter() - start
         return f"Reconstructed {item.name!r}: {state.record['title']}, {state.record['voxels']}, in {seconds:.1f} s"
 
@@ -224,13 +223,6 @@ class _LiveResult:
                 item.hide_set(True)
                 self._hidden.append(item.session_uid)
 
-    def tidy(self) -> None:
-        """Remove the files of states that are not shown any more."""
-        unused = set(storage.unused_volumes())
-        for path in self.files:
-            if path in unused:
-                path.unlink(missing_ok=True)
-
     def clear(self) -> None:
         """Restore scene and files as they were before the job."""
         item = jobs.find_by_uid(bpy.data.objects, self._item)
@@ -252,7 +244,7 @@ class _LiveResult:
                 images.store_png(ids.RECONSTRUCTION, self._old_picture)
             elif image is not None:
                 bpy.data.images.remove(image)
-        self.tidy()
+        storage.remove_results(self.files)
 
 
 def _scores(run: ProjectionRun, volume: Volume, progress: Progress | None) -> dict[str, Any]:

@@ -37,8 +37,7 @@ def calibrate_job(context: bpy.types.Context, path: Path, apply: bool = True, ex
     def finish(result: tuple[Calibration, bytes]) -> str:
         """Show the shifts, move the modules if `apply` is set, and return the line to report."""
         calibration, picture = result
-        collection = jobs.find_by_uid(bpy.data.collections, uid)
-        if collection is None:
+        if (collection := jobs.find_by_uid(bpy.data.collections, uid)) is None:
             raise InputError("the scanner that was calibrated is gone")
         _require_same_scanner(collection, calibration)
         if apply:

@@ -78,8 +78,7 @@ def read_request(context: bpy.types.Context) -> Request:
     scene = context.scene
     collection = scanner.required_scanner(scene)
     recipe = runs.panel_recipe(scene).updated({"system.modules": None})
-    camera = selection.active_module(context)
-    if camera is None:
+    if (camera := selection.active_module(context)) is None:
         raise InputError("no module is active: select its camera, or choose it in the Modules panel")
     system = scanner.read_module(collection, camera)
     model = recipe_model(recipe, system)

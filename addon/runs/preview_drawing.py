@@ -151,6 +151,5 @@ def _covered_width(context: bpy.types.Context) -> float:
     """Return the width, pixels, of the region's right part that the sidebar covers."""
     if not context.preferences.system.use_region_overlap:
         return 0.0
-    return float(
-        max((region.width for region in context.area.regions if region.type == "UI" and region.width > 1), default=0)
-    )
+    widths = [region.width for region in context.area.regions if region.type == "UI" and region.width > 1]
+    return float(max(widths, default=0))

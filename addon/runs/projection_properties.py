@@ -144,16 +144,6 @@ def makes_counts(settings: ProjectionProperties) -> bool:
     return settings.model == "EMISSION" or counts_xrays or (settings.model == "TRANSMISSION" and settings.photons > 0)
 
 
-def _is_ours(self: ProjectionProperties, item: bpy.types.Object) -> bool:
-    """Return whether an object can be chosen as the volume to project: one of ours, but no map."""
-    return volumes.is_volume(item) and volumes.quantity_of(item) not in MAPS
-
-
-def _attenuates(self: ProjectionProperties, item: bpy.types.Object) -> bool:
-    """Return whether an object can be chosen as the attenuation: a volume of mu or CT numbers."""
-    return volumes.is_volume(item) and volumes.quantity_of(item) in ("mu", "hu")
-
-
 class RunProperties(bpy.types.PropertyGroup):
     """Properties of a run in the scene's list `ProjectionProperties.runs`, written by `addon/runs/runs.py`."""
 
@@ -198,21 +188,19 @@ class ProjectionProperties(ProjectionSettings, bpy.types.PropertyGroup):
     """State of the Projections panel; `Scene.mphdrr_projections`."""
 
     volume: PointerProperty(name="Volume", description="Volume to project; empty: the active volume, or the only one",
-                            type=bpy.types.Object, poll=_is_ours, update=_volume_chosen)  # fmt: skip
+                            type=bpy.types.Object, update=_volume_chosen, poll=lambda self, item:
+                            volumes.is_volume(item) and volumes.quantity_of(item) not in MAPS)  # fmt: skip
     all_modules: BoolProperty(name="All Modules", description="Project into every module, not a range of numbers",
                               get=_projects_all, set=_project_all)  # fmt: skip
-    fitted: StringProperty(
-        name="Fitted Model", description="Model chosen for the volume's quantity", options={"HIDDEN"}
-    )
+    fitted: StringProperty(name="Fitted", description="Model chosen for the volume's quantity", options={"HIDDEN"})
     mu: PointerProperty(
         name="Attenuation", description="Volume of attenuation coefficients (1/mm) before the pinhole, or of CT numbers, "
         "which attenuate each line of the isotope at its energy; empty: none",
-        type=bpy.types.Object, poll=_attenuates,
+        type=bpy.types.Object,
+        poll=lambda self, item: volumes.is_volume(item) and volumes.quantity_of(item) in ("mu", "hu"),
     )  # fmt: skip
     runs: CollectionProperty(type=RunProperties, name="Runs", options={"HIDDEN"})
-    active_run: IntProperty(
-        name="Run", description="Run in the list whose images are shown", update=on_edit("active_run")
-    )
+    active_run: IntProperty(name="Run", description="Run whose images are shown", update=on_edit("active_run"))
     run_file: path_property("Run", "File with the shown run's exact arrays", "HIDDEN")
     run_summary: StringProperty(name="Shown Run", description="Contents of the shown run", options={"HIDDEN"})
 

@@ -14,6 +14,7 @@ import bpy
 from ...core import ProjectionRun, Recipe, memory, read_recipe, read_run, write_run
 from ...core.arrays import Floats
 from ...core.errors import InputError, warn
+from ...core.files import ensure_folder
 from ...core.geometry.system import chosen_modules
 from ...core.progress import Progress, Stages, stages_of
 from ...core.projector import Model
@@ -72,6 +73,7 @@ def render_job(context: bpy.types.Context, recipe: Recipe, volume: str = "", mu:
             mosaic = yield from store_and_show(scene, run, path, state, owner, pictures)
             scene.mphdrr_projections.runs[-1].keep = number < len(paths) - 1  # each frame is a run
         images.show_below(mosaic, bpy.context)
+        path = storage.absolute(scene.mphdrr_projections.run_file)
         location = path if bpy.data.filepath else f"{path} until the .blend is saved"
         seconds = time.perf_counter() - start
         return f"Projected {recipe['volume.object']!r} into {len(run.views)} modules in {seconds:.1f} s: {location}"
@@ -87,6 +89,7 @@ def render_job(context: bpy.types.Context, recipe: Recipe, volume: str = "", mu:
 def write_and_draw(run: ProjectionRun, path: Path, display: Display, stages: Stages) -> images.Pictures:
     """Write a run's file and make its pictures, in a job's worker thread."""
     stages("writing the run file")
+    ensure_folder(path.parent)  # a Save As has removed it if it was empty
     write_run(run, path)
     return images.make_pictures(run, display, stages("packing"))
 

@@ -82,7 +82,7 @@ def add_run(
         unique, number = f"{name} {number}", number + 1
     item = settings.runs.add()
     item.name = item.usual_name = unique
-    item.file, item.summary = storage.stored_path(path.absolute()), run_summary(run)
+    item.file, item.summary = storage.stored_path(storage.adopt(path.absolute())), run_summary(run)
     item.state, item.scanner = json.dumps(state) if state else "", collection
     mark_shown(scene, len(settings.runs) - 1)
 
@@ -131,8 +131,7 @@ def holds_counts(scene: bpy.types.Scene) -> bool | None:
 
 def required_run(scene: bpy.types.Scene, action: str) -> bpy.types.PropertyGroup:
     """Return the shown run; raise `InputError`, which names the `action`, where there is none."""
-    item = shown_run(scene)
-    if item is None:
+    if (item := shown_run(scene)) is None:
         raise InputError(f"nothing to {action}: render the projections first, or choose a run")
     return item
 
@@ -311,12 +310,10 @@ def _module_changes(
             changed.setdefault(name, {})[int(number)] = pair
     for verb, quantity in (("moved", "length"), ("turned", "angle")):
         axes = [name for name in changed if kind.columns[name].axis is not None and kind.columns[name].kind == quantity]
-        numbers = sorted({number for name in axes for number in changed[name]})
-        if numbers:
+        if numbers := sorted({number for name in axes for number in changed[name]}):
             yield f"{_modules_text(numbers, count)} {verb}", numbers
     for column in kind.columns.scalars.values():
-        pairs_of = changed.get(column.name, {})
-        if pairs_of:
+        if pairs_of := changed.get(column.name, {}):
             (old_value, new_value), *more_pairs = set(pairs_of.values())
             unit, factor = next(iter(column.units.items()))
             if not column.is_text:
@@ -374,10 +371,8 @@ def _volume_changes(
     if item is not None and item not in volumes.volume_objects(scene):
         item = None  # Blender keeps a volume that the user has deleted
     if old is None or item is None:
-        if old is not None and role:
-            yield f"{role}{old['name']}, now none"
-        elif old is not None:
-            yield f"volume {old['name']} is gone"
+        if old is not None:
+            yield f"{role}{old['name']}, now none" if role else f"volume {old['name']} is gone"
         elif item is not None:
             yield f"{role}none, now {item.name}"
         return

@@ -20,8 +20,7 @@ def show(
     The factor 0 makes the longest arrow about 50 mm long. Where nothing has moved, there is no arrow and the factor is 0.
     """
     objects.remove_objects([item for item in collection.objects if item.mphdrr_module.part == "ARROWS"])
-    longest = float(np.linalg.norm(ends - starts, axis=1).max())
-    if not longest:
+    if not (longest := float(np.linalg.norm(ends - starts, axis=1).max())):
         return 0.0
     factor = factor or float(f"{_LONGEST / longest:.1g}")
     curve = bpy.data.curves.new(ids.ARROWS, "CURVE")

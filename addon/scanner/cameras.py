@@ -27,9 +27,13 @@ def camera_matrices(poses: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def module_poses(matrices: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the poses (M, 4, 4) of modules from their cameras' world matrices (M, 4, 4), whose scale is removed."""
+    """Return the poses (M, 4, 4) of modules from their cameras' world matrices (M, 4, 4), whose scale is removed.
+
+    A module that is mirrored, as by its parent's scale, is itself again with +u to the other side.
+    """
     poses = matrices @ _CAMERA_FROM_MODULE
     poses[:, :3, :3] /= np.linalg.norm(poses[:, :3, :3], axis=1, keepdims=True)
+    poses[:, :3, 0] *= np.sign(np.linalg.det(poses[:, :3, :3]))[:, None]
     return poses
 
 

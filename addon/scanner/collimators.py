@@ -72,8 +72,7 @@ def resize_sphere(mesh: bpy.types.Mesh, radius: float) -> None:
 def part_material(part: str) -> bpy.types.Material:
     """Return the material of a scanner's parts of one kind; an existing one keeps the user's changes."""
     name, look = LOOKS[part]
-    material = bpy.data.materials.get(name)
-    if material is not None:
+    if (material := bpy.data.materials.get(name)) is not None:
         return material
     material, shader = compat.surface_material(name, "ShaderNodeBsdfPrincipled")
     # These show in Solid view; the shader's inputs show in renders.

@@ -71,9 +71,7 @@ class ColumnMapTable(bpy.types.PropertyGroup):
                             update=_edited)  # fmt: skip
     first_row: IntProperty(name="First Row", description="Row of the first module", default=2, min=1, update=_edited)
     last_row: IntProperty(name="Last Row", description="Row of the last module", default=2, min=1, update=_edited)
-    skip_rows: StringProperty(
-        name="Skip Rows", description="Rows in between without a module, such as 43, 50-52", update=_edited
-    )
+    skip_rows: StringProperty(name="Skip Rows", description="Rows without a module, such as 43, 50-52", update=_edited)
     number: StringProperty(
         name="Number Column",
         description="Letters of the column with module numbers or names. Empty: the rows are modules 1, 2, ...",
@@ -123,7 +121,7 @@ class ColumnMapProperties(bpy.types.PropertyGroup):
     remarks: StringProperty(name="Remarks", description="The reader's warnings, JSON", options={"HIDDEN"})
     n_modules: IntProperty(name="Modules", description="Number of modules that are read", min=0)
     preview: StringProperty(
-        name="Preview", description="Headings, then rows of numbers as they are read, JSON", options={"HIDDEN"}
+        name="Preview", description="Headings, then rows as they are read, JSON", options={"HIDDEN"}
     )
 
 

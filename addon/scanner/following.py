@@ -11,6 +11,7 @@ from operator import attrgetter, itemgetter
 
 import bpy
 import numpy as np
+from numpy.typing import NDArray
 
 from ...core.errors import InputError
 from ...core.geometry.module_parts import ModulePart
@@ -119,15 +120,15 @@ def _refresh_modules(kind: ScannerType, parts: _Parts, scanner: bpy.types.Proper
     """Make modules follow, all together, which is faster than one by one; return whether a value has changed."""
     cameras_, matrices = list(parts), objects.world_matrices(list(parts))
     placement = read_placement(kind, cameras_, matrices)
-    to_aim = []
+    aim, to_aim = aim and scanner.keep_aimed, []
     for m, (camera, position) in enumerate(zip(cameras_, matrices[:, :3, 3], strict=True)):
         module = camera.mphdrr_module
         if np.any(np.array(module.placed, np.float32) != position.astype(np.float32)):
-            if aim and scanner.keep_aimed and not placement.aimed[m] and module.built and is_free(camera):
+            if aim and not placement.aimed[m] and module.built and objects.is_moved_by_hand(camera):
                 to_aim.append(m)  # `built` is empty for a new module, which keeps its direction
             module.placed = position
     for m in to_aim:
-        objects.set_world_matrix(cameras_[m], cameras.camera_matrices(placement.aims[m]))
+        aim_camera(cameras_[m], placement.aims[m])
         matrices[m] = objects.world_matrix(cameras_[m])
         placement.moved[m] = placement.aimed[m] = True
     _last_matrices.update(zip((o.session_uid for o in cameras_), map(np.ndarray.tobytes, matrices), strict=True))
@@ -139,6 +140,11 @@ def _refresh_modules(kind: ScannerType, parts: _Parts, scanner: bpy.types.Proper
         for ms, system in read_in_groups(kind, cameras_, placement)  # ms: indices of modules
     ]
     return any(changed)
+
+
+def aim_camera(camera: bpy.types.Object, pose: NDArray[np.float64]) -> None:
+    """Turn a module's camera to the direction of a pose (4, 4) at its position."""
+    objects.set_world_matrix(camera, cameras.camera_matrices(pose), ("location", "scale"))
 
 
 def _update_modules(
@@ -169,13 +175,6 @@ def _update_modules(
     return bool(changed)
 
 
-def is_free(item: bpy.types.Object) -> bool:
-    """Return whether only the user moves an object: no animation, driver or constraint does."""
-    data = item.animation_data
-    is_animated = data is not None and (data.action is not None or len(data.drivers) or len(data.nla_tracks))
-    return not is_animated and not len(item.constraints)
-
-
 def _rebuild(
     system: Scanner, cameras_: Sequence[bpy.types.Object], parts: _Parts, scanner: bpy.types.PropertyGroup
 ) -> None:
@@ -189,8 +188,7 @@ def _rebuild(
         if camera.data.users == 1 and not cameras.is_set_to(camera.data, tuple(field)):
             cameras.set_field_of_view(camera.data, tuple(field))
         text = repr((size, construction))
-        items = [item for item in parts[camera] if _is_outdated(item.data, text)]
-        if items:
+        if items := [item for item in parts[camera] if _is_outdated(item.data, text)]:
             outdated.append((m, text, items))
     if outdated:
         _reshape(system, cameras_, outdated, scanner)

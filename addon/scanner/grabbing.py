@@ -15,7 +15,7 @@ from mathutils import Matrix
 from numpy.typing import NDArray
 
 from ..blender import objects
-from . import collimators, following
+from . import collimators
 
 _HOME = "mphdrr_home"  # custom property of a plane: its matrix (4, 4) relative to its camera
 _START = "mphdrr_start"  # custom property of a dragged part: its camera's world matrix (4, 4) at the start of the drag
@@ -58,7 +58,7 @@ def is_displaced(item: bpy.types.Object) -> bool:
         return False
     part = item.mphdrr_module.part
     has_copy = sum(o.mphdrr_module.part == part for o in camera.children) > 1  # then it is unclear which one leads
-    return following.is_free(item) and item.parent_type == "OBJECT" and not has_copy
+    return objects.is_free(item) and item.parent_type == "OBJECT" and not has_copy
 
 
 def move_modules_with(items: Iterable[bpy.types.Object], dragging: bool) -> set[bpy.types.Object]:
@@ -73,7 +73,7 @@ def move_modules_with(items: Iterable[bpy.types.Object], dragging: bool) -> set[
             start = np.reshape(item[_START], (4, 4)) if is_dragged(item) else objects.world_matrix(camera)
             motion: Any = np.array(item.matrix_basis, np.float64) @ np.linalg.inv(home)
             motion[:3, :3] /= np.linalg.norm(motion[:3, :3], axis=0)
-            _move(camera, start @ motion)
+            _move(camera, start @ motion * objects.mirror_signs(camera))
             starts[camera] = start
         if not dragging:
             put_back(item)
@@ -105,7 +105,7 @@ def _is_moved_itself(camera: bpy.types.Object, dragging: bool) -> bool:
     """
     position = objects.world_matrix(camera)[:3, 3].astype(np.float32)
     was_moved = np.any(np.array(camera.mphdrr_module.placed, np.float32) != position)
-    return bool(was_moved) or (dragging and camera.select_get()) or not following.is_free(camera)
+    return bool(was_moved) or (dragging and camera.select_get()) or not objects.is_free(camera)
 
 
 def _home(item: bpy.types.Object) -> Matrix:
@@ -117,7 +117,7 @@ def _home(item: bpy.types.Object) -> Matrix:
 def _move(camera: bpy.types.Object, matrix: NDArray[np.float64]) -> None:
     """Move a camera to a world matrix, as far as its locks allow."""
     location, rotation = camera.location.copy(), camera.rotation_euler.copy()
-    objects.set_world_matrix(camera, matrix)
+    objects.set_world_matrix(camera, matrix, ("scale",))
     for axis in range(3):
         if camera.lock_location[axis]:
             camera.location[axis] = location[axis]

@@ -52,8 +52,7 @@ def map_job(
         """Add the map to the scene, or replace the scanner's map of this quantity, and return the line to report."""
         collection = bpy.data.collections.get(owner)  # None if it has been removed since
         maps = (map_ for map_ in volumes.volume_objects(scene) if volumes.quantity_of(map_) == quantity)
-        item = next((map_ for map_ in maps if _belongs_to(map_, collection)), None)
-        if item is not None:
+        if (item := next((map_ for map_ in maps if _belongs_to(map_, collection)), None)) is not None:
             volumes.replace_stored(item, stored)
         else:
             item = volumes.add_stored(stored, name, scene.collection)
@@ -76,9 +75,8 @@ mapping = map_job  # the name in version 0.2.0, for scripts
 def _belongs_to(item: bpy.types.Object, collection: bpy.types.Collection | None) -> bool:
     """Return whether a volume is a map of a scanner; maps of earlier versions, which name no scanner, belong to any."""
     settings = item.mphdrr_volume
-    return settings.scanner == collection or (
-        settings.scanner is None and item.name.startswith(_map_name(settings.quantity))
-    )
+    is_of_any = settings.scanner is None and item.name.startswith(_map_name(settings.quantity))
+    return settings.scanner == collection or is_of_any
 
 
 def _map_name(quantity: str) -> str:

@@ -157,7 +157,7 @@ def duplicate_modules(
         copy.animation_data_clear()
         for owner in camera.users_collection:
             owner.objects.link(copy)
-        objects.set_world_matrix(copy, cameras.camera_matrices(module.poses())[0])
+        objects.set_world_matrix(copy, cameras.camera_matrices(module.poses())[0], ("scale",))
         make_module(collection, copy, module)
         copies_.append(copy)
     following.refresh(collection)
@@ -236,8 +236,7 @@ def renumber(collection: bpy.types.Collection, order: Literal["RINGS", "LIST"] =
     They are listed, projected and exported in that order from now on. Names that the user gave stay. Raises InputError
     where the scanner is untidy, or its numbers are impossible; it stays as it was.
     """
-    untidy_items = untidy_text(collection)
-    if untidy_items:
+    if untidy_items := untidy_text(collection):
         raise InputError(f"scanner '{collection.name}': {untidy_items}: press Tidy Modules in the Design panel first")
     system, camera_objects = scanner.read_scanner(collection), scanner.modules(collection)
     new_order = np.arange(len(camera_objects))
@@ -273,7 +272,7 @@ def has_modules_of(collection: bpy.types.Collection, system: Scanner) -> bool:
     cameras_ = scanner.modules(collection)
     numbers = sorted(camera.mphdrr_module.number for camera in cameras_)
     is_kind = module_values.kind_of(collection) is type(system)
-    return is_kind and numbers == sorted(system.numbers.tolist()) and all(map(following.is_free, cameras_))
+    return is_kind and numbers == sorted(system.numbers.tolist()) and all(map(objects.is_free, cameras_))
 
 
 def set_modules(collection: bpy.types.Collection, system: Scanner) -> None:
@@ -289,7 +288,7 @@ def set_modules(collection: bpy.types.Collection, system: Scanner) -> None:
     with following.writing():
         module_values.write_modules(ordered, system)
         for camera, matrix in zip(ordered, cameras.camera_matrices(system.poses()), strict=True):
-            objects.set_world_matrix(camera, matrix)
+            objects.set_world_matrix(camera, matrix, ("scale",))
         if module_values.unaimed_numbers(collection, ordered):
             collection.mphdrr_scanner.keep_aimed = False
     scanner.store_saved_state(collection, system)
@@ -306,7 +305,7 @@ def move_modules(collection: bpy.types.Collection, system: PinholeSystem) -> Non
     matrices, lengths = cameras.camera_matrices(system.poses()), system.collimator_length.tolist()
     with following.writing():
         for camera, matrix, length in zip(cameras_, matrices, lengths, strict=True):
-            objects.set_world_matrix(camera, matrix)
+            objects.set_world_matrix(camera, matrix, ("scale",))
             camera.mphdrr_module.collimator_length = length
             camera.mphdrr_module.length_mode = module_values.TYPED
         if module_values.unaimed_numbers(collection, cameras_):

@@ -21,7 +21,7 @@ from ...core.geometry.columns import Column
 from ...core.geometry.frames import module_poses
 from ...core.geometry.scanner import Scanner
 from ...core.scanner_kinds import scanner_kind
-from ..blender import decimals, objects
+from ..blender import objects
 from . import cameras, columns
 
 FROM_ROI, TYPED = "FROM_ROI", "TYPED"  # values of `mphdrr_module.length_mode`
@@ -195,11 +195,9 @@ def _current_poses(
     Unmoved modules have their poses as imported.
     """
     imported = np.reshape([values["pose"] for values in exact], (-1, 4, 4))
-    current = cameras.module_poses(matrices)
+    signs = np.reshape([objects.mirror_signs(camera) for camera in cameras_], (-1, 1, 4))
+    current = cameras.module_poses(matrices * signs)
     position, imported_position = current[:, :3, 3], imported[:, :3, 3]
-    for m, axis in np.argwhere(position.astype(np.float32) != imported_position.astype(np.float32)).tolist():
-        if cameras_[m].parent is None and not len(cameras_[m].constraints):
-            position[m, axis] = decimals.typed(position[m, axis])
     rounding = 4 * np.spacing(np.abs(imported_position).max(axis=1).astype(np.float32))
     is_unmoved = np.abs(position - imported_position) <= rounding[:, None]
     is_turned = np.abs(current[:, :3, :3] - imported[:, :3, :3]).max(axis=(1, 2)) > _ROUNDING
@@ -214,8 +212,7 @@ def _aimed_poses(kind: ScannerType, poses: NDArray[np.float64]) -> tuple[NDArray
     A rolled module is not aimed. Kinds without aiming, and modules at the isocentre, are taken as aimed.
     """
     aims, aimed, is_away = poses.copy(), np.ones(len(poses), bool), np.any(poses[:, :3, 3], axis=1)
-    away_aims = kind.aimed(poses[is_away, :3, 3])
-    if away_aims is not None:
+    if (away_aims := kind.aimed(poses[is_away, :3, 3])) is not None:
         aims[is_away], aimed[is_away] = away_aims, np.abs(poses[is_away] - away_aims).max(axis=(1, 2)) <= _AIM_ERROR
     return aims, aimed
 

@@ -203,8 +203,7 @@ def active_scanner(scene: bpy.types.Scene) -> bpy.types.Collection | None:
 
 def required_scanner(scene: bpy.types.Scene) -> bpy.types.Collection:
     """Return the scanner that the panels work on; raise `InputError` where there is none."""
-    collection = active_scanner(scene)
-    if collection is None:
+    if (collection := active_scanner(scene)) is None:
         raise InputError("no scanner in the scene: import a workbook first")
     return collection
 
@@ -225,14 +224,14 @@ def read_scanner(collection: bpy.types.Collection) -> Scanner:
     that a script has just moved are refreshed first: Blender has not yet called the handlers. Raises InputError for no
     modules, equal module numbers and impossible values.
     """
-    following.refresh(collection)
     cameras_ = modules(collection)
+    objects.require_evaluated(cameras_)
+    following.refresh(collection)
     if not cameras_:
         raise InputError(f"collection '{collection.name}' has no modules: import a geometry first")
     by_number: dict[int, bpy.types.Object] = {}
     for camera in cameras_:
-        first = by_number.setdefault(camera.mphdrr_module.number, camera)
-        if first is not camera:
+        if (first := by_number.setdefault(camera.mphdrr_module.number, camera)) is not camera:
             number, advice = camera.mphdrr_module.number, "press Tidy Modules in the Design panel, or delete one"
             raise InputError(f"'{first.name}' and '{camera.name}' both have module number {number}: {advice}")
     is_added = any(camera.mphdrr_module.added for camera in cameras_)
@@ -293,10 +292,9 @@ def aim_modules(collection: bpy.types.Collection) -> list[int]:
     cameras_ = modules(collection)
     placement = read_placement(kind_of(collection), cameras_, objects.world_matrices(cameras_))
     turned = []
-    matrices = cameras.camera_matrices(placement.aims)
-    for camera, matrix, is_aimed in zip(cameras_, matrices, placement.aimed, strict=True):
+    for camera, pose, is_aimed in zip(cameras_, placement.aims, placement.aimed, strict=True):
         if not is_aimed:
-            objects.set_world_matrix(camera, matrix)
+            following.aim_camera(camera, pose)
             turned.append(camera.mphdrr_module.number)
     following.refresh(collection)
     return sorted(turned)

@@ -39,8 +39,7 @@ def export_workbook_job(collection: bpy.types.Collection, path: Path, use_templa
         written_columns = workbook.write_system(system, path, template, columns).columns
         with recording.recorded_warnings():  # the writer has already warned of the template's doubts
             written = workbook.read_scanner(path, system.kind, written_columns)
-        difference = _difference(system, written)
-        if difference:
+        if difference := _difference(system, written):
             problem = f"was written, but reads back differently ({difference})"
             raise InputError(f"{path}: {problem}; the scene keeps its numbers")
         # The scene keeps its own float64 numbers, from which the workbook's may differ in the last digit.
@@ -48,10 +47,9 @@ def export_workbook_job(collection: bpy.types.Collection, path: Path, use_templa
 
     def finish(written: Scanner) -> str:
         """Store that the scene's scanner is that of the workbook, and return the line to report."""
-        collection = bpy.data.collections.get(name)
-        if collection is not None:
+        if (collection := bpy.data.collections.get(name)) is not None:
             scanner.store_saved_state(collection, written)
-        return f"Wrote {len(written)} modules to {path}"
+        return f"Wrote {len(written)} modules of {name!r} to {path}"
 
     return jobs.Job("Exporting the workbook", work, finish)
 
@@ -73,6 +71,7 @@ def export_program_job(
     options = {} if construction is None else asdict(construction)
     if construction is not None:
         options["opening_degrees"] = decimals.typed(math.degrees(options.pop("opening_angle")))
+    name = collection.name
     system: Any = scanner.read_scanner(collection)  # `write_geometry` refuses kinds that the format cannot express
     views = system.views(shape, detector, magnification=magnification)
     arguments = {name: value for name, value in options.items() if name in FORMATS[format].options}
@@ -82,7 +81,7 @@ def export_program_job(
         stages_of(progress)("writing the file")
         write_geometry(system, path, format, views=views, **arguments)
 
-    return jobs.Job("Exporting the geometry", work, lambda _: f"Wrote {len(system)} modules to {path}")
+    return jobs.Job("Exporting the geometry", work, lambda _: f"Wrote {len(system)} modules of {name!r} to {path}")
 
 
 def _template_workbook(collection: bpy.types.Collection) -> Path | None:

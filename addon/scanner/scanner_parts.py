@@ -61,8 +61,7 @@ class NewScanner:
 
     def _make_roi(self, system: Scanner) -> bpy.types.Object | None:
         """Make the ROI sphere of a system that has one."""
-        roi = pinholes.new_roi(system, self._materials["ROI"])
-        if roi is not None:
+        if (roi := pinholes.new_roi(system, self._materials["ROI"])) is not None:
             self._keep(roi.data, "ROI")
             self._keep(roi, "ROI")
         return roi
@@ -151,8 +150,7 @@ def clear(scene: bpy.types.Scene, collection: bpy.types.Collection, replacements
     bpy.data.batch_remove([o for o in parts if o not in replacement_of])
     rings = set(owners[1:])
     for camera, users in bpy.data.user_map(subset=set(replacement_of)).items():
-        new = replacement_of[camera]
-        if new is not None:
+        if (new := replacement_of[camera]) is not None:
             cameras.copy_backgrounds(new.data, camera.data)
             if users - rings:
                 camera.user_remap(new)

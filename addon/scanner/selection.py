@@ -16,8 +16,7 @@ SCANNER: reports.Need = (
 
 def active_module(context: bpy.types.Context) -> bpy.types.Object | None:
     """Return the camera of the module that is active in the viewport, or whose part is; else that of the panel's list."""
-    collection = scanner.active_scanner(context.scene)
-    if collection is None:
+    if (collection := scanner.active_scanner(context.scene)) is None:
         return None
     item = module_of(context.view_layer.objects.active)
     if item is not None and item.name in collection.all_objects:
@@ -34,8 +33,7 @@ def listed_module(scene: bpy.types.Scene) -> bpy.types.Object | None:
 
 def selected_modules(context: bpy.types.Context) -> list[bpy.types.Object]:
     """Return the cameras of the active scanner's selected modules (or of selected parts), in order; else the active one."""
-    collection = scanner.active_scanner(context.scene)
-    if collection is None:
+    if (collection := scanner.active_scanner(context.scene)) is None:
         return []
     selected = {module_of(item) for item in context.view_layer.objects.selected}
     active = active_module(context)
@@ -82,8 +80,7 @@ def after_update(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None
 
 def scanner_chosen(scene: bpy.types.Scene) -> None:
     """Make the first module of a scanner active that was chosen in the panel."""
-    collection = scanner.active_scanner(scene)
-    if collection is not None and not following.is_writing():
+    if (collection := scanner.active_scanner(scene)) is not None and not following.is_writing():
         _activate_in_list(scene, next(iter(scanner.modules(collection)), None))
 
 

@@ -74,8 +74,7 @@ def surface_of(item: bpy.types.Object) -> bpy.types.Object | None:
 
 def remove_surface(item: bpy.types.Object) -> None:
     """Remove a volume's surface, if it has one, with its mesh, materials and nodes."""
-    surface = surface_of(item)
-    if surface is not None:
+    if (surface := surface_of(item)) is not None:
         unused = [surface.modifiers[1].node_group, *surface.data.materials]
         objects.remove_objects([surface])
         objects.remove_unused(unused)
@@ -84,8 +83,7 @@ def remove_surface(item: bpy.types.Object) -> None:
 def _surface_offset(item: bpy.types.Object) -> Vector:
     """Return the offset, mm, from where Blender places a surface, that of the drawn voxels, to the voxels' centres."""
     item.data.grids.load()
-    grid = item.data.grids.get(item.mphdrr_volume.quantity)
-    if grid is None:  # its file is missing
+    if (grid := item.data.grids.get(item.mphdrr_volume.quantity)) is None:  # its file is missing
         return Vector()
     return grid.matrix_object.to_3x3() @ Vector([-compat.VDB_CENTER_SHIFT] * 3)
 

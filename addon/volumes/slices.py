@@ -180,10 +180,8 @@ def before_load(*_: object) -> None:
 def before_save(*_: object) -> None:
     """Pack the planes' images: Blender does not save painted pixels otherwise."""
     for item in bpy.data.objects:
-        if _KEY in item:
-            image = _image(item)
-            if image is not None and image.is_dirty:
-                image.pack()
+        if _KEY in item and (image := _image(item)) is not None and image.is_dirty:
+            image.pack()
 
 
 def after_update(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None:

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ...core import Grid, InputError, Volume
+from ...core.files import ensure_folder
 from ...core.geometry.frames import affine_matrix, checked_affine
 from ..blender import compat, ids
 from . import vdb, volume_materials
@@ -78,6 +79,7 @@ def write_states(states: Sequence[Volume], folder: Path, provenance: dict[str, A
 
     def write(stem: str, states: Sequence[Volume], provenance: Any, smoke_above: float | None) -> Path:
         """Write the states to .vdb files whose names begin with `stem`, and return the first path."""
+        ensure_folder(folder)  # a Save As has removed it if it was empty
         paths = [folder / f"{stem}{f'_{k:04d}' if len(states) > 1 else ''}.vdb" for k in range(1, len(states) + 1)]
         for state, path in zip(states, paths, strict=True):
             if not path.exists():

@@ -15,11 +15,14 @@ from mathutils import Matrix
 from numpy.typing import ArrayLike, NDArray
 
 from ...core import InputError, Volume, memory
+from ...core.errors import warn
 from ...core.geometry.frames import checked_affine
 from ...core.progress import Progress, stages_of
 from ..blender import compat, ids, jobs, objects, reports, storage
 from . import vdb, volume_materials
 from .stored_volumes import StoredVolume, move_grid, store_volume, write_states
+
+_MICROMETER = 1e-3  # mm
 
 
 def add_volume(
@@ -44,10 +47,18 @@ def add_volume(
 
 def add_stored(stored: StoredVolume, name: str, collection: bpy.types.Collection | None = None) -> bpy.types.Object:
     """Put a stored volume into the scene as a Volume object with a material."""
+    _check_voxel_size(name, stored.volume.grid.spacing)
     item = bpy.data.objects.new(name, _volume_data(stored, name))
     (collection or bpy.context.scene.collection).objects.link(item)
     _set_properties(item, stored)
     return item
+
+
+def _check_voxel_size(name: str, spacing: ArrayLike) -> None:
+    """Warn of voxels below a micrometre, as of meshes that were made in metres."""
+    if np.min(spacing) < _MICROMETER:
+        advice = "a unit of the scene is 1 mm, so scale by 1000 what was made in metres"
+        warn(f"{name!r} has voxels of {np.min(spacing):.3g} mm, below a micrometre: {advice}")
 
 
 def add_volume_job(
@@ -128,12 +139,14 @@ def reader(item: bpy.types.Object, path: Path | None = None) -> Callable[[], Vol
     `path` is the file of a state (`storage.state_files`), by default that of the current frame.
     """
     path, pose = file_and_pose(item, path)
+    _check_voxel_size(item.name, item.mphdrr_volume.spacing * np.linalg.norm(pose[:3, :3], axis=0))
     return lambda: move_grid(vdb.read_vdb(path), pose)
 
 
 def file_and_pose(item: bpy.types.Object, path: Path | None = None) -> tuple[Path, NDArray[np.float64]]:
     """Return the file with every voxel of a Volume object, and its pose (4, 4), mm; `InputError` where there is no file."""
     require_volume(item)
+    objects.require_evaluated([item])
     if path is None and _frame_number(item.data) is None:
         raise InputError(f"{item.name!r} has no state at frame {bpy.context.scene.frame_current}")
     pose, path = pose_of_object(item), path or file_of(item)
@@ -168,8 +181,7 @@ def state_text(item: bpy.types.Object) -> str:
 
 def file_note(item: bpy.types.Object) -> str:
     """Return the size of a Volume object's file in words, or "missing"."""
-    size = storage.file_size(file_of(item))
-    if size is None:
+    if (size := storage.file_size(file_of(item))) is None:
         return "missing"
     display_note = ", coarser copy shown" if ids.PREVIEW in item.data.filepath else ""
     storage_note = "" if bpy.data.filepath else ", until saved"
@@ -270,7 +282,8 @@ def _volume_data(stored: StoredVolume, name: str) -> bpy.types.Volume:
 def _load_files(data: bpy.types.Volume, stored: StoredVolume) -> None:
     """Make a datablock show a stored volume; where Blender cannot load the file, it keeps the previous one."""
     previous = data.is_sequence, data.filepath
-    data.is_sequence, data.filepath = False, storage.stored_path(stored.path)
+    path = storage.adopt(stored.path)
+    data.is_sequence, data.filepath = False, storage.stored_path(path)
     error = ""
     # A successful load keeps the error message of an earlier failed one, as after a crash; unloading drops it.
     data.grids.load()
@@ -281,7 +294,7 @@ def _load_files(data: bpy.types.Volume, stored: StoredVolume) -> None:
         error = f"Blender finds no grid {stored.volume.quantity!r} in it"
     if error:
         data.is_sequence, data.filepath = previous
-        raise InputError(f"{stored.path}: {error}")
+        raise InputError(f"{path}: {error}")
     # The active grid is the one that the solid viewport draws.
     data.grids.active_index = data.grids.find(vdb.SMOKE if vdb.SMOKE in data.grids else stored.volume.quantity)
     if len(stored.states) > 1:  # set after loading: a sequence would look for frame 0 until the scene is evaluated

@@ -124,9 +124,8 @@ def pack(event: EventArrays, recipe: EventRecipe, geometry: dict[str, Any], thre
             _write_dataset(file, name, images, recipe["storage.images"], (1, *images.shape[1:]), pool, {"unit": unit})
 
     with ThreadPoolExecutor(threads or cores()) as pool:
-        return hdf5.pack(
-            _KIND, {"event": str(planned.number), "recipe": recipe.fingerprint, "build": build()}, write_contents
-        )
+        fields = {"event": str(planned.number), "recipe": recipe.fingerprint, "build": build()}
+        return hdf5.pack(_KIND, fields, write_contents)
 
 
 def _write_truth(file: Any, truth: Volume, recipe: EventRecipe, pool: ThreadPoolExecutor) -> None:

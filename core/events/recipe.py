@@ -206,8 +206,7 @@ class EventRecipe:
     @cached_property
     def splits(self) -> dict[str, float]:
         """The fractions of the events in each split, by name, which sum to 1; empty without a table [splits]."""
-        splits = read_table(self.values, "splits")
-        if splits:
+        if splits := read_table(self.values, "splits"):
             check_odds(list(splits.values()), len(splits), "splits")
             for name in splits:
                 require_name(name, "splits")

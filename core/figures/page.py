@@ -54,9 +54,8 @@ class Page:
     def image(self, picture: Bytes, left: int, top: int, width: int, height: int) -> None:
         """Put a picture (h, w, 3) into a rectangle; enlarged pixels stay squares."""
         rows, columns = max(1, height), max(1, width)
-        self._pixels[top : top + rows, left : left + columns] = (
-            picture if picture.shape[:2] == (rows, columns) else resize_picture(picture, rows, columns)
-        )
+        pixels = picture if picture.shape[:2] == (rows, columns) else resize_picture(picture, rows, columns)
+        self._pixels[top : top + rows, left : left + columns] = pixels
         encoded = base64.b64encode(png_bytes(picture)).decode()
         style = ' style="image-rendering:pixelated"' if picture.shape[1] < columns else ""
         self._marks.append(

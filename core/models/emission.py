@@ -279,8 +279,7 @@ class Emission(Model):
             if isinstance(value, np.ndarray):
                 settings[name] = value.tolist() if value.ndim == 1 else "images"
         volumes = mu_volumes(self.mu)  # type: ignore[arg-type]  # in a model a tuple, not any sequence
-        grids = [{"shape": list(mu.grid.shape), "affine": mu.grid.affine.tolist()} for mu in volumes]
-        if grids:
+        if grids := [{"shape": list(mu.grid.shape), "affine": mu.grid.affine.tolist()} for mu in volumes]:
             settings["mu"] = grids if isinstance(self.mu, tuple) else grids[0]
         return settings
 

@@ -55,9 +55,8 @@ class JaszczakPhantom(Phantom):
     def shapes(self) -> Sequence[Shape]:
         """Cylinder of water, rods and spheres."""
         base, plastic_mu = -self.height / 2, attenuation("PMMA", self.mu_energy)
-        shapes: list[Shape] = [
-            Cylinder(radius=self.radius, height=self.height, activity=self.activity, mu=self.mu, name="water")
-        ]
+        water = Cylinder(radius=self.radius, height=self.height, activity=self.activity, mu=self.mu, name="water")
+        shapes: list[Shape] = [water]
         if any(self.rod_diameters):
             rods = DerenzoRods(radius=self.radius, rod_diameters=self.rod_diameters, height=self.rod_height,
                                name="rods", position=(0, 0, base + self.rod_height / 2), activity=self.rod_activity,

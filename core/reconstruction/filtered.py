@@ -56,9 +56,8 @@ def rows_across(images: Array, views: Views, axis: Array, name: str) -> tuple[Ar
     Raise `InputError` if neither rows nor columns lie in that plane. Warn if the images do not fall to about 0 at their edge
     columns.
     """
-    along_rows, along_columns = (
-        np.abs(steps @ axis) / np.linalg.norm(steps, axis=1) for steps in (views.u_steps, views.v_steps)
-    )
+    steps = np.stack([views.u_steps, views.v_steps])
+    along_rows, along_columns = np.abs(steps @ axis) / np.linalg.norm(steps, axis=2)
     if along_columns.max() < along_rows.min():
         swapped = replace(views, u_steps=views.v_steps, v_steps=views.u_steps, shape=views.shape[::-1])
         images, views, along_rows = images.swapaxes(1, 2), swapped, along_columns

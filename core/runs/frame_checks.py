@@ -36,16 +36,14 @@ def warn_of_frames(
     counts = {k: np.where(declared_dead[k], 0, array[k]) if declared_dead[k].any() else array[k] for k in used}
     rates = {k: float(counts[k].sum(dtype=float)) / seconds[k] for k in used}
     usual_rate = float(np.median([rate for rate in rates.values() if rate] or [0.0]))
-    empty = [k for k in used if not rates[k] and usual_rate * seconds[k] > _FEW and not declared_dead[k].all()]
-    if empty:
+    if empty := [k for k in used if not rates[k] and usual_rate * seconds[k] > _FEW and not declared_dead[k].all()]:
         typical = usual_rate * float(np.median(list(seconds.values())))
         warn(f"{name}: no counts in {_some([labels[k] for k in empty])}, {typical:g} in others")
     first_frames: dict[bytes, int] = {}
     pairs = [(first_frames.setdefault(counts[k].tobytes(), k), k) for k in used if np.count_nonzero(counts[k]) > _FEW]
     if equal := [f"{labels[first]} and {labels[k]}" for first, k in pairs if first != k]:
         warn(f"{name}: equal in every pixel: {_some(equal)}")
-    dead = [(k, *place) for k in sorted(used) for place in _empty_pixels(counts[k], declared_dead[k])]
-    if dead:
+    if dead := [(k, *place) for k in sorted(used) for place in _empty_pixels(counts[k], declared_dead[k])]:
         listed = _some([f"{labels[k]}, row {row + 1}, column {column + 1}" for k, row, column in dead])
         warn(f"{name}: no counts in {listed}, {_WELL} and more around; if they are dead, say so (--efficiency)")
     usual_peak_rate = sorted([0.0, *(float(counts[k].max()) / seconds[k] for k in used)])[len(used) // 2]

@@ -7,14 +7,13 @@ lies on the crystal. To add a format, write its reader and add its endings to `_
 import math
 import os
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from ..arrays import Array, Floats
-from ..errors import InputError, reading, warn
+from ..errors import InputError, reading
 from ..files import AnyPath, require_file
 from ..hdf5 import datasets, opened, read_numbers
 from ..progress import Progress, tell
@@ -69,25 +68,6 @@ class Counts(np.ndarray[Any, Any]):
         return [time for time in np.unique(self.about[frames, 0]).tolist() if math.isfinite(time)]
 
 
-@dataclass(frozen=True)
-class CountsLayout:
-    """Description of a file's contents by the user, with the arguments of `read_counts`."""
-
-    dataset: str | None = None
-    """Name of the array in a file with several arrays."""
-    shape: tuple[int, int, int] | None = None
-    """Frames, rows and columns of a raw file."""
-    type: str | None = None
-    """Type of the numbers in a raw file, one of `RAW_TYPES`."""
-    big_endian: bool = False
-    """Whether the most significant byte of a raw file's numbers comes first."""
-
-    @property
-    def is_raw(self) -> bool:
-        """Whether the description is that of raw numbers."""
-        return self.shape is not None or self.type is not None or self.big_endian
-
-
 def read_counts(
     path: AnyPath | Sequence[AnyPath],
     *,
@@ -117,13 +97,12 @@ def read_counts(
         Array (frames, rows, columns) of the file's own type. `counts_run` checks its numbers, and compares its arguments
         with the exposure, pixel size and energy windows in the file.
     """
-    layout = CountsLayout(dataset, shape, type, big_endian)
     paths = [Path(path)] if isinstance(path, str | os.PathLike) else list(map(Path, path))
     if not paths:
         raise InputError("counts: expected a file, or several")
     counts_of_files: list[Counts] = []
     for number, file in enumerate(paths, 1):
-        counts_of_files.append(_read_file(file, layout))
+        counts_of_files.append(_read_file(file, dataset, shape, type, big_endian))
         first_shape, last_shape = counts_of_files[0].shape[1:], counts_of_files[-1].shape[1:]
         if first_shape != last_shape:
             shapes_text = f"{last_shape[0]} x {last_shape[1]} pixels, {paths[0]} of {first_shape[0]} x {first_shape[1]}"
@@ -132,34 +111,34 @@ def read_counts(
     counts = counts_of_files[0] if len(counts_of_files) == 1 else np.concatenate(counts_of_files).view(Counts)
     counts.about = np.concatenate([file_counts.about for file_counts in counts_of_files])
     names = [file.name for file in paths]
-    starts, assumption = aligned_starts([file_counts.about[:, 4] for file_counts in counts_of_files], names)
-    if assumption:
-        warn(assumption)
+    starts = aligned_starts([file_counts.about[:, 4] for file_counts in counts_of_files], names)
     counts.about[:, 4] = starts - np.min(starts, initial=np.inf, where=np.isfinite(starts))
     counts.kind = ", ".join(sorted({file_counts.kind for file_counts in counts_of_files} - {""}))
     counts.name = ", ".join([*names[:3], *(["…"] if len(names) > 3 else [])])
     return counts
 
 
-def _read_file(path: Path, layout: CountsLayout) -> Counts:
+def _read_file(path: Path, dataset: str | None, shape: Any, raw_type: str | None, big_endian: bool) -> Counts:
     """Return the frames of one file; raise `InputError`, which names the file, if they cannot be read."""
     require_file(path)
     ending = path.suffix.lower()
     with reading(path, ending or "counts"):
-        if layout.is_raw:
-            return _checked_frames(FileFrames(_read_raw(path, layout)))
-        if layout.dataset is not None and ending not in (".npz", ".h5", ".hdf5"):
+        if shape is not None or raw_type is not None or big_endian:
+            return _checked_frames(FileFrames(_read_raw(path, shape, raw_type, big_endian)))
+        if dataset is None:
+            return _checked_frames(_reader(path, ending)(path))
+        if ending not in (".npz", ".h5", ".hdf5"):
             raise InputError("dataset (--dataset) names an array in .npz and .h5; this file has no names")
-        return _checked_frames(_reader(path, ending)(path, layout))
+        return _checked_frames(_READERS[ending](path, dataset.strip("/")))
 
 
-def _reader(path: Path, ending: str) -> Callable[[Path, CountsLayout], FileFrames]:
+def _reader(path: Path, ending: str) -> Callable[..., FileFrames]:
     """Return the function that reads a file with this ending, in lower case."""
     if ending in _READERS:
         return _READERS[ending]
     for is_of_format, reader in ((is_dicom, nuclear_medicine.read), (interfile.begins, interfile.read)):
         if is_of_format(path):
-            return lambda path, layout: reader(path)
+            return reader
     header = path.with_suffix(".hdr")
     beside = f"its header {header.name}, which is beside it, or " if header.is_file() else ""
     raw = "of raw numbers say the shape (--raw-shape FRAMES ROWS COLUMNS) and the type (--raw-type uint16)"
@@ -181,50 +160,49 @@ def _checked_frames(frames: FileFrames) -> Counts:
     return counts
 
 
-def _read_raw(path: Path, layout: CountsLayout) -> Array:
-    """Return the numbers of a raw file in the described shape (frames, rows, columns)."""
-    if layout.shape is None or layout.type is None:
-        shape, kind = "shape (--raw-shape FRAMES ROWS COLUMNS)", "type (--raw-type, uint16 or so)"
-        raise InputError(f"raw numbers need their {shape if layout.shape is None else kind}")
-    one_of(layout.type, RAW_TYPES, "raw type")
-    type_ = np.dtype(layout.type).newbyteorder(">" if layout.big_endian else "<")
-    return file_numbers(path, type_, whole_shape(layout.shape, "raw shape (--raw-shape)", 3))
+def _read_raw(path: Path, shape: Any, raw_type: str | None, big_endian: bool) -> Array:
+    """Return the numbers of a raw file in the described `shape` (frames, rows, columns)."""
+    if shape is None or raw_type is None:
+        missing = "shape (--raw-shape FRAMES ROWS COLUMNS)" if shape is None else "type (--raw-type, uint16 or so)"
+        raise InputError(f"raw numbers need their {missing}")
+    one_of(raw_type, RAW_TYPES, "raw type")
+    number_type = np.dtype(raw_type).newbyteorder(">" if big_endian else "<")
+    return file_numbers(path, number_type, whole_shape(shape, "raw shape (--raw-shape)", 3))
 
 
-def _read_numpy(path: Path, layout: CountsLayout) -> FileFrames:
+def _read_numpy(path: Path, dataset: str | None = None) -> FileFrames:
     """Return the frames of a .npy or .npz file."""
     arrays = numpy_files.load(path)
-    return FileFrames(arrays["" if path.suffix.lower() == ".npy" else _array_name(arrays, layout)])
+    return FileFrames(arrays["" if path.suffix.lower() == ".npy" else _array_name(arrays, dataset)])
 
 
-def _read_hdf5(path: Path, layout: CountsLayout) -> FileFrames:
+def _read_hdf5(path: Path, dataset: str | None = None) -> FileFrames:
     """Return the frames of an HDF5 file."""
     import h5py
 
     with opened(path, whole=True) as file:
         arrays = datasets(file)
-        if layout.dataset is not None and isinstance(file.get(layout.dataset), h5py.Dataset):
-            arrays[layout.dataset.strip("/")] = file[layout.dataset]  # `datasets` has one of an array's names
-        dataset = arrays[_array_name(arrays, layout)]
-        require_memory(dataset.shape, dataset.dtype.itemsize)
-        return FileFrames(read_numbers(dataset))
+        if dataset is not None and isinstance(file.get(dataset), h5py.Dataset):
+            arrays[dataset] = file[dataset]  # `datasets` has one of an array's names
+        array = arrays[_array_name(arrays, dataset)]
+        require_memory(array.shape, array.dtype.itemsize)
+        return FileFrames(read_numbers(array))
 
 
-def _array_name(arrays: dict[str, Any], layout: CountsLayout) -> str:
+def _array_name(arrays: dict[str, Any], dataset: str | None) -> str:
     """Return the name of the array with the frames: the one that the user names, or the only one of three axes."""
     three_axes = [name for name, array in arrays.items() if array.ndim == 3]
-    if layout.dataset is not None:
-        name = layout.dataset.strip("/")
-        if name not in arrays:
-            raise InputError(f"no dataset {layout.dataset!r} in it; there are: {', '.join(arrays) or 'none'}")
-        return name
+    if dataset is not None:
+        if dataset not in arrays:
+            raise InputError(f"no dataset {dataset!r} in it; there are: {', '.join(arrays) or 'none'}")
+        return dataset
     if len(three_axes) != 1:
         listed = ", ".join(f"{name} ({' x '.join(map(str, a.shape))})" for name, a in arrays.items()) or "none"
         raise InputError(f"{len(three_axes) or 'no'} arrays of three axes in it; say which (--dataset NAME): {listed}")
     return three_axes[0]
 
 
-def _read_metaimage(path: Path, layout: CountsLayout) -> FileFrames:
+def _read_metaimage(path: Path) -> FileFrames:
     """Return the frames of a MetaImage file as GATE 10 writes projections: x along a row, y down the rows, a frame per z."""
     with recorded_warnings() as orientation_warnings:  # the user gives the orientation anyway
         contents = metaimage.read(path)
@@ -243,12 +221,12 @@ def differs(recorded: float, expected: float, is_rounded: bool = False) -> bool:
     return not (math.isnan(recorded) or math.isclose(recorded, expected, rel_tol=_SAME_SIZE, abs_tol=rounding))
 
 
-_READERS: dict[str, Callable[[Path, CountsLayout], FileFrames]] = {
+_READERS: dict[str, Callable[..., FileFrames]] = {
     **dict.fromkeys((".npy", ".npz"), _read_numpy),
     **dict.fromkeys((".h5", ".hdf5"), _read_hdf5),
-    ".dcm": lambda path, layout: nuclear_medicine.read(path),
+    ".dcm": nuclear_medicine.read,
     **dict.fromkeys((".mhd", ".mha"), _read_metaimage),
-    **dict.fromkeys((".hdr", ".h33", ".hs", ".h00"), lambda path, layout: interfile.read(path)),
+    **dict.fromkeys((".hdr", ".h33", ".hs", ".h00"), interfile.read),
 }
 """Readers by the endings of their files, in lower case."""
 COUNTS_FORMATS = (*_READERS, ".raw", ".bin", ".dat")

@@ -16,7 +16,7 @@ from ..arrays import Floats
 from ..errors import InputError
 from ..files import require_file
 from .frame_facts import FileFrames, file_numbers, rescaled
-from .stated_times import moment, past_midnight, stated_duration, stated_number
+from .stated_times import DAY, moment, stated_duration, stated_number
 
 _LONGEST_HEADER = 1 << 20  # bytes
 _NUMBER_TYPES = ("u1", "u2", "u4", "u8", "i1", "i2", "i4", "i8", "f4", "f8")
@@ -59,7 +59,7 @@ def read(path: Path) -> FileFrames:
     for name, word in (("low", "lower"), ("high", "upper")):
         keys = [f"energy window {word} level [{window}]" for window in facts["window"]]
         facts[name] = [stated_number(header.text(key), key, "keV") for key in keys]
-    facts["time"], facts["start"] = _times(header, n_frames, n_windows)
+    facts["time"], facts["start"] = _times(header, n_frames)
     kind = f"{n_windows} energy windows" if n_windows > 1 else ""
     return FileFrames(rescaled(frames, *_scale(header, n_frames)), kind, facts)
 
@@ -90,9 +90,9 @@ class _Header:
             raise InputError(f"{key} = {values[0]} and {values[1]}: expected one value")
         return values[0] if values else default
 
-    def numbers(self, key: str, default: float = math.nan) -> list[float]:
-        """Return the numbers of a key's values, NaN for one that says nothing; [default] where the key is missing."""
-        return [stated_number(text, key) for text in self.all(key)] or [default]
+    def pauses(self, key: str, n_groups: int) -> list[float]:
+        """Return the pause, s, of each frame group; 0 for one that the header does not state."""
+        return _in_blocks([stated_number(text, key, default=0.0) for text in self.all(key)] or [0.0], [], n_groups, key)
 
     def whole(self, key: str, default: int | None = None, least: int = 1) -> int:
         """Return the whole number of a key, at least `least`, or the default where the header says none."""
@@ -109,8 +109,7 @@ class _Header:
     def pixel_size(self, axis: int) -> float:
         """Return the size of a pixel along axis 1 or 2, mm; NaN where the header says none."""
         for key in self.values:
-            match = re.fullmatch(rf"scaling factor( \((.*)\))? \[{axis}\]", key)
-            if match is not None:
+            if (match := re.fullmatch(rf"scaling factor( \((.*)\))? \[{axis}\]", key)) is not None:
                 size = stated_duration(self.text(key), key)
                 unit = (match[2] or "").replace(" ", "")
                 if unit not in _MILLIMETRES and not math.isnan(size):
@@ -121,25 +120,26 @@ class _Header:
 
 def _scale(header: _Header, n_frames: int) -> tuple[Floats, float]:
     """Return the factor of each frame's numbers and the number to be added; several factors that differ are refused."""
-    scales: dict[str, list[float]] = {}
-    for key in header.values:
-        name = re.sub(r" \[\d+\]$", "", key)
-        if _FACTOR.fullmatch(name) or _OFFSET.fullmatch(name):
-            texts = ["1" if text.lower() in _UNITS_OF_COUNTS else text for text in header.all(name)]
-            neutral = 1.0 if _FACTOR.fullmatch(name) else 0.0
-            numbers = [stated_number(text, name, "a factor of the counts") for text in texts]
-            numbers = [neutral if math.isnan(number) else number for number in numbers]
-            if any(number != neutral for number in numbers):
-                scales[name] = numbers
-    factors = [(name, numbers) for name, numbers in scales.items() if _FACTOR.fullmatch(name)]
-    if any(numbers != factors[0][1] for _, numbers in factors):
-        pair = " and ".join(f"{name} = {', '.join(map(str, numbers))}" for name, numbers in factors[:2])
-        raise InputError(f"{pair}: expected one factor of the counts")
-    offsets = [number for name, numbers in scales.items() if _OFFSET.fullmatch(name) for number in numbers]
-    if len(set(offsets)) > 1:
-        raise InputError(f"several rescale offsets ({', '.join(map(str, offsets))}): expected one")
-    slopes = _in_blocks(factors[0][1] if factors else [1.0], [], n_frames, factors[0][0] if factors else "")
-    return np.array(slopes), offsets[0] if offsets else 0.0
+    factors, offsets = _stated_scales(header, _FACTOR, 1.0), _stated_scales(header, _OFFSET, 0.0)
+    if any(numbers != next(iter(factors.values())) for numbers in factors.values()):
+        listed = " and ".join(f"{name} = {', '.join(map(str, numbers))}" for name, numbers in factors.items())
+        raise InputError(f"{listed}: expected one factor of the counts")
+    values = [number for numbers in offsets.values() for number in numbers] or [0.0]
+    if len(set(values)) > 1:
+        raise InputError(f"several rescale offsets ({', '.join(map(str, values))}): expected one")
+    key, slopes = next(iter(factors.items()), ("", [1.0]))
+    return np.array(_in_blocks(slopes, [], n_frames, key)), values[0]
+
+
+def _stated_scales(header: _Header, pattern: re.Pattern[str], neutral: float) -> dict[str, list[float]]:
+    """Return the numbers of the keys of a `pattern`, by key without [ ], unless all are `neutral`."""
+    scales = {}
+    for name in filter(pattern.fullmatch, dict.fromkeys(re.sub(r" \[\d+\]$", "", key) for key in header.values)):
+        texts = ["1" if text.lower() in _UNITS_OF_COUNTS else text for text in header.all(name)]
+        numbers = [stated_number(text, name, "a factor of the counts", neutral) for text in texts]
+        if any(number != neutral for number in numbers):
+            scales[name] = numbers
+    return scales
 
 
 def _in_blocks(values: list[float], sizes: list[int], n_frames: int, key: str) -> list[float]:
@@ -157,7 +157,7 @@ def _in_blocks(values: list[float], sizes: list[int], n_frames: int, key: str) -
     return [value for value in values for _ in range(n_frames // len(values))]
 
 
-def _times(header: _Header, n_frames: int, n_windows: int) -> tuple[list[float], list[float]]:
+def _times(header: _Header, n_frames: int) -> tuple[list[float], list[float]]:
     """Return the exposures of all frames, s, and their starts, s after any moment; NaN or empty if not stated."""
     is_gated = any(key.startswith(("gated", "gspect", "number of images in time window")) for key in header.values)
     is_gated |= "gated" in header.text("type of data").lower()
@@ -176,13 +176,13 @@ def _times(header: _Header, n_frames: int, n_windows: int) -> tuple[list[float],
             raise InputError(f"{cycle_key}: {len(cycles)} values beside {len(durations)} of {key}; expected as many")
         durations = np.multiply(durations, cycles).tolist()
     times = _in_blocks(durations, sizes, n_frames, key)
-    return times, _starts(header, times, [] if is_gated else sizes, n_frames // n_windows)
+    return times, _starts(header, times, [] if is_gated else sizes)
 
 
-def _starts(header: _Header, times: list[float], sizes: list[int], n_images: int) -> list[float]:
+def _starts(header: _Header, times: list[float], sizes: list[int]) -> list[float]:
     """Return the starts of the frames, s after any moment; empty where the header says none.
 
-    Images of frame groups, in `sizes` in each energy window's `n_images`, follow each other with the stated pauses.
+    Images of frame groups, of `sizes` in each energy window, follow each other with the stated pauses.
     """
     day, clock = header.text("study date"), header.text("study time")
     clocks = [moment(day, text, "image start time") for text in header.all("image start time")]
@@ -193,13 +193,11 @@ def _starts(header: _Header, times: list[float], sizes: list[int], n_images: int
     if relative:
         starts = _in_blocks(relative, sizes, n_frames, relative_key)
     elif len(clocks) > 1:
-        return _in_blocks(past_midnight(np.array(clocks)).tolist(), sizes, n_frames, "image start time")
+        starts = [clock + DAY * (clock < begin - DAY / 2) for clock in clocks]  # of the day after the first's
+        return _in_blocks(starts, sizes, n_frames, "image start time")
     elif sizes and header.whole("number of detector heads", 1) == 1:
-        keys = "pause between images (sec)", "pause between frame groups (sec)"
-        between_images, between_groups = (
-            [0.0 if math.isnan(pause) else pause for pause in _in_blocks(header.numbers(key, 0.0), [], len(sizes), key)]
-            for key in keys
-        )
+        between_images = header.pauses("pause between images (sec)", len(sizes))
+        between_groups = header.pauses("pause between frame groups (sec)", len(sizes))
         starts, end = [], 0.0
         for group, size in enumerate(sizes):
             for _ in range(size):

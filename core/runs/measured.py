@@ -221,8 +221,7 @@ def _parse_numbers(text: str) -> list[int | None]:
     """Return the numbers of a text such as "1-20, 45, 40-21, none*2", None for "none"."""
     numbers: list[int | None] = []
     for part in filter(None, re.split(r"[\s,;]+", re.sub(r"\s*([-*])\s*", r"\1", text.strip().lower()))):
-        match = re.fullmatch(r"(?:(\d+)(?:-(\d+))?|none(?:\*(\d+))?)", part)
-        if match is None:
+        if (match := re.fullmatch(r"(?:(\d+)(?:-(\d+))?|none(?:\*(\d+))?)", part)) is None:
             raise InputError(f"frames (--frames): {part!r} is no number, no range such as 1-20 or 20-1, and not none")
         first, last = int(match[1] or 1), int(match[2] or match[1] or match[3] or 1)
         if abs(last - first) + len(numbers) >= _MAX_FRAMES:

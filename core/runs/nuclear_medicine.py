@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 
 from ..errors import InputError
-from ..volumes.formats.dicom import TOMOGRAMS, decode_pixels, image_kind, require_grey
-from ..volumes.formats.dicom_units import real_world_values, unit_of
+from ..volumes.formats.dicom import TOMOGRAMS, decode_pixels, image_kind, require_grey, stated_rescaling
+from ..volumes.formats.dicom_units import RealWorldValues, real_world_values, unit_of
 from .frame_facts import FileFrames, require_memory, rescaled
-from .stated_times import moment, stated_duration, stated_number
+from .stated_times import moment, stated_duration
 
 _VECTORS = ("Energy Window", "Detector", "Phase", "Rotation", "RR Interval", "Time Slot")
 """Properties of frames of which a nuclear medicine image may have several values."""
@@ -28,7 +28,7 @@ def read(path: Path) -> FileFrames:
     require_grey(dataset)
     shape = int(dataset.get("NumberOfFrames") or 1), int(dataset.Rows), int(dataset.Columns)
     require_memory(shape, 4)
-    slope, intercept = _scale(dataset)
+    slope, intercept, *_ = _values(dataset)
     frames = rescaled(decode_pixels(dataset).reshape(shape), slope, intercept)
     vector_sizes = {name: int(dataset.get(f"NumberOf{name.replace(' ', '')}s") or 1) for name in _VECTORS}
     content = ", ".join(f"{n} {name.lower()}s" for name, n in vector_sizes.items() if n > 1)
@@ -40,21 +40,15 @@ def read(path: Path) -> FileFrames:
     return FileFrames(frames, content, facts)
 
 
-def _scale(dataset: Any) -> tuple[float, float]:
-    """Return slope and intercept from stored values to counts; `InputError` where the file states two that differ."""
-    numbers = [stated_number(dataset.get(name), name) for name in ("RescaleSlope", "RescaleIntercept")]
-    slope, intercept = (default if math.isnan(x) else x for x, default in zip(numbers, (1.0, 0.0), strict=True))
-    mapped = real_world_values(dataset)
-    if mapped is None:
-        return slope, intercept
-    unit = unit_of(mapped.code)
-    if unit is None or unit.quantity != "counts":
+def _values(dataset: Any) -> RealWorldValues:
+    """Return the rescaling from stored values to counts; `InputError` where the file states two that differ."""
+    rescaling = stated_rescaling(dataset, "{counts}")
+    mapped = real_world_values(dataset) or rescaling
+    if (unit := unit_of(mapped.code)) is None or unit.quantity != "counts":
         raise InputError(f"RealWorldValueMapping: values in {mapped.code or 'no unit'}; expected counts ({{counts}})")
-    pair = mapped.slope, mapped.intercept
-    if (slope, intercept) not in ((1.0, 0.0), pair):
-        stated = f"{slope:g} x value + {intercept:g}, RealWorldValueMapping {pair[0]:g} x value + {pair[1]:g}"
-        raise InputError(f"its rescaling is {stated}: expected one of them")
-    return pair
+    if rescaling[:2] not in ((1.0, 0.0), mapped[:2]):
+        raise InputError(f"its rescaling is {rescaling}, RealWorldValueMapping {mapped}: expected one of them")
+    return mapped
 
 
 def _durations(data: Any, n_frames: int) -> list[float]:

@@ -198,9 +198,7 @@ def reconstruction_recipe(run: ProjectionRun, recipe: Recipe | None = None) -> R
     if recipe is None:
         return run.recipe
     values = {key: value for key, value in recipe.given.items() if key.partition(".")[0] in HOW_TABLES}
-    if run.is_measured and isinstance(
-        values.get("model.start"), int | float
-    ):  # as in an import, the start of the first frame
+    if run.is_measured and isinstance(values.get("model.start"), int | float):  # that of the first frame, as in imports
         starts = np.asarray(run.recipe["model.start"])
         values["model.start"] = (values["model.start"] + starts - starts.min()).tolist()
     return Recipe(values) if "recipe" not in run.settings and "model.kind" in values else run.recipe.updated(values)
@@ -222,8 +220,7 @@ def _compare_with_record(run: ProjectionRun, recipe: Recipe, has_mu: bool) -> No
         expected["mu"] = None
     names = [name for name in expected if name in record and f"model.{name}" not in SAMPLING]
     pairs = ((name, record[name], expected[name]) for name in names)
-    differences = [f"{name} {old}, not {new}" for name, old, new in pairs if not _is_close(new, old)]
-    if differences:
+    if differences := [f"{name} {old}, not {new}" for name, old, new in pairs if not _is_close(new, old)]:
         warn(f"the run's record says of its model: {'; '.join(differences)} as in the model that is given", 3)
 
 

@@ -8,7 +8,7 @@ from itertools import pairwise
 import numpy as np
 
 from ..arrays import Floats
-from ..errors import InputError, expecting
+from ..errors import InputError, expecting, warn
 
 DAY = 86400.0
 """Length of a day, s."""
@@ -21,14 +21,14 @@ _CLOCK = re.compile(
 )
 
 
-def stated_number(text: object, name: str, expected: str = "a number") -> float:
-    """Return the finite number that a file states; NaN for a text that says nothing, such as "" and "unknown".
+def stated_number(text: object, name: str, expected: str = "a number", default: float = math.nan) -> float:
+    """Return the finite number that a file states, or `default` for a text that says nothing, such as "" and "unknown".
 
     `InputError` for other texts names the field `name` and what was `expected`.
     """
     words = str("" if text is None else text).strip()
     if words.lower() in _UNSTATED:
-        return math.nan
+        return default
     refusal = f"{name} = {words}: expected {expected}"
     with expecting(refusal):
         number = float(words)
@@ -57,8 +57,7 @@ def moment(day: object, clock: object, name: str) -> float:
     seconds = 0.0
     if day_text:
         refusal = f"{name}: date {day_text}: expected year, month and day, such as 2024:03:01"
-        match = _DATE.fullmatch(day_text)
-        if match is None:
+        if (match := _DATE.fullmatch(day_text)) is None:
             raise InputError(refusal)
         with expecting(refusal):
             seconds = DAY * date(*map(int, filter(None, match.groups()))).toordinal()
@@ -73,13 +72,8 @@ def moment(day: object, clock: object, name: str) -> float:
     return seconds + 3600.0 * hours + 60.0 * minutes + rest
 
 
-def past_midnight(starts: Floats) -> Floats:
-    """Return the moments, s, of a file's frames, with a day added to those more than half a day before the first."""
-    return starts + DAY * (starts < starts[0] - _HALF_DAY) if len(starts) else starts
-
-
-def aligned_starts(starts: list[Floats], names: list[str]) -> tuple[Floats, str]:
-    """Return the moments, s, of the frames of several files one after the other, and a text to warn of ("" for none).
+def aligned_starts(starts: list[Floats], names: list[str]) -> Floats:
+    """Return the moments, s, of the frames of several files one after the other; warn where a day has to be assumed.
 
     Raises `InputError` where some files state a date and others none, or where only dates could tell the order.
     """
@@ -88,19 +82,19 @@ def aligned_starts(starts: list[Floats], names: list[str]) -> tuple[Floats, str]
     dated = [k for k in stated if firsts[k] > _FIRST_DATED]
     if dated and len(dated) < len(stated):
         undated = next(k for k in stated if k not in dated)
-        raise InputError(
-            f"{names[undated]}: its start has no date, that of {names[dated[0]]} has; expected a date in both"
-        )
-    days, text = dict.fromkeys(stated, 0.0), ""
-    for previous, k in [] if dated else list(pairwise(stated)):
+        pair = f"{names[undated]}: its start has no date, that of {names[dated[0]]} has"
+        raise InputError(f"{pair}; expected a date in both")
+    days = dict.fromkeys(stated, 0.0)
+    for previous, k in () if dated else pairwise(stated):
         gap = firsts[k] - firsts[previous]
         clocks = f"{_clock(firsts[previous])} and {_clock(firsts[k])}"
         pair = f"{names[previous]} and {names[k]} start at {clocks}, without a date"
         if gap > _HALF_DAY:
             raise InputError(f"{pair}: which is earlier? expected dates, or the files in the order of time")
         days[k] = days[previous] + DAY * (gap < -_HALF_DAY)
-        text = text or (f"{pair}: the later one is taken to be of the next day" if gap < -_HALF_DAY else "")
-    return np.concatenate([of_file + days.get(k, 0.0) for k, of_file in enumerate(starts)]), text
+        if days[k] > days[previous] == 0:
+            warn(f"{pair}: the later one is taken to be of the next day")
+    return np.concatenate([of_file + days.get(k, 0.0) for k, of_file in enumerate(starts)])
 
 
 def _clock(seconds: float) -> str:

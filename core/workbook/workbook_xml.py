@@ -90,9 +90,7 @@ class WorkbookXml:
         """
         settings = [e.attributes for e in self._elements if e.name == "calcPr"]
         if any(a.get("fullPrecision") in ("0", "false") for a in settings):
-            raise InputError(
-                'it calculates with the displayed digits: switch off "Set precision as displayed", and save'
-            )
+            raise InputError('it calculates with displayed digits: switch off "Set precision as displayed", and save')
         is_asked = any(a.get(name) in ("1", "true") for a in settings for name in ("fullCalcOnLoad", "forceFullCalc"))
         return is_asked or any(a.get("calcCompleted") in ("0", "false") for a in settings)
 

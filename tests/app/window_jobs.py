@@ -107,6 +107,21 @@ def steps():
     while jobs.is_running():
         yield 0.05
     seen["added"] = sorted(name for name in ("A", "B", "C") if name in bpy.data.objects)
+    # Saved as another file while two jobs run: what they make goes with it, and the first file's folder stays as it was.
+    bpy.ops.wm.save_as_mainfile(filepath=str(folder / "old.blend"))
+    before = sorted(path.name for path in (folder / "old_mphdrr").glob("*"))
+    start(mph.render_projections, **render)
+    start(mph.add_derenzo, name="E", voxels=192)
+    yield 0.3
+    seen["running"] = jobs.is_running() and len(jobs._waiting)
+    bpy.ops.wm.save_as_mainfile(filepath=str(folder / "new.blend"))
+    while jobs.is_running():
+        yield 0.05
+    yield 0.3
+    seen["old_folder"] = [before, sorted(path.name for path in (folder / "old_mphdrr").glob("*"))]
+    run_path = bpy.context.scene.mphdrr_projections.run_file
+    seen["saved_meanwhile"] = [bpy.data.objects["E"].data.filepath, run_path]
+    seen["exists"] = [Path(bpy.path.abspath(path)).is_file() for path in seen["saved_meanwhile"]]
     # Disabled while a job does not look up.
     show, jobs.Worker.show = jobs.Worker.show, lambda self, *step: time.sleep(3.0)
     start(mph.add_derenzo, name="D", voxels=192)

@@ -89,8 +89,7 @@ def _expected_size(work: Making) -> str:
     from ...events.store import file_size
 
     missing = len(work.missing)
-    sizes = [file_size(location) for location in islice(work.folder.store.locations().values(), 100)]
-    if sizes:
+    if sizes := [file_size(location) for location in islice(work.folder.store.locations().values(), 100)]:
         mean_size = sum(sizes) / len(sizes)
         return f"about {readable_size(mean_size)} each, {readable_size(mean_size * missing)} in all"
     raw = work.folder.maker.raw_bytes

@@ -76,9 +76,8 @@ def _table(rows: list[dict[str, Any]]) -> Iterator[str]:
     """Yield a line of text for each event, below a heading."""
     names = max(7, *(len(str(row["phantom"])) for row in rows))
     splits = max(5, *(len(row["split"] or "") for row in rows))
-    yield f"{'event':>6}  {'phantom':<{names}}  {'split':<{splits}}" + "".join(
-        f"{text:>9}" for text in ("x mm", "y mm", "z mm", "phi °", "theta °", "psi °")
-    )
+    titles = "".join(f"{text:>9}" for text in ("x mm", "y mm", "z mm", "phi °", "theta °", "psi °"))
+    yield f"{'event':>6}  {'phantom':<{names}}  {'split':<{splits}}{titles}"
     for row in rows:
         numbers = "".join(f"{row[column]:9.2f}" for column in _COLUMNS)
         yield f"{row['event']:6d}  {row['phantom']:<{names}}  {row['split'] or '':<{splits}}{numbers}"

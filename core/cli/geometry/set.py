@@ -56,9 +56,7 @@ def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
             extra["metavar"] = letters if is_vector else _METAVARS.get(column.kind, "N")
         help_text = ", ".join(dict.fromkeys(c.help for c in columns)) + "; degrees" * (column.kind == "angle")
         add(f"--{_option_name(name)}", dest=name, help=help_text, **extra)
-    length = (
-        "collimator length, or 'design' for the design formula's; default: as it was, or by the formula if it was that"
-    )
+    length = "collimator length, or 'design' for the design formula's; default: as it was, or the formula's if it was"
     add("--length", metavar="MM", help=length)
     add("--move", type=float, nargs=3, metavar=("X", "Y", "Z"), help="shift of the modules, mm")
     add("--remove", metavar="RANGE", help="modules to remove")

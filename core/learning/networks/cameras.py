@@ -95,10 +95,7 @@ class CameraNets(Network):
         view_volumes = setup.maps.to_views(volumes, cameras)  # (B, V, volumes, n_u, n_v, n_k)
         n_k = view_volumes.shape[-1]
         view_images = images.transpose(-1, -2)[..., None].expand(*view_volumes.shape[:2], 2, *view_volumes.shape[3:])
-        depth = torch.linspace(-1, 1, n_k, dtype=view_volumes.dtype, device=view_volumes.device).expand_as(
-            view_volumes[:, :, :1]
-        )
-        outputs = self.camera(torch.cat([view_images, view_volumes, depth], 2).flatten(0, 1)).unflatten(
-            0, view_volumes.shape[:2]
-        )
-        return setup.maps.to_volume(outputs, cameras)
+        depths = torch.linspace(-1, 1, n_k, dtype=view_volumes.dtype, device=view_volumes.device)
+        depth = depths.expand_as(view_volumes[:, :, :1])
+        outputs = self.camera(torch.cat([view_images, view_volumes, depth], 2).flatten(0, 1))
+        return setup.maps.to_volume(outputs.unflatten(0, view_volumes.shape[:2]), cameras)

@@ -56,10 +56,8 @@ class _Slice:
     spacing: tuple[float, float]  # distances between rows and between columns, mm
     orientation: Floats  # unit vectors (2, 3) along a row and down the rows, LPS
     position: Floats  # centre (3,) of the first pixel, mm, LPS
-    slope: float  # value = slope * stored value + intercept
-    intercept: float  # in the unit of the values
+    values: RealWorldValues  # slope, intercept and unit of the values, from the stored ones
     thickness: float  # slice thickness, mm, or 0 if not stated
-    unit: str  # code for the values' unit, of DICOM or UCUM, or ""
     is_rescaled: bool  # whether the file states the rescaling
 
     @property
@@ -97,7 +95,7 @@ def read(path: Path, series: str | None = None, progress: Progress | None = None
     """
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", module="pydicom")  # warnings of tags that are not used here
-        headers = _choose_series(_read_headers(path), path, series)
+        headers = _choose_series(_read_headers(path), series)
         if len(headers) > 1 and any(_is_whole_volume(header) for _, header in headers):
             names = ", ".join(file.name for file, _ in headers)
             raise InputError(f"its series has several files of several frames each, choose one: {names}")
@@ -107,12 +105,12 @@ def read(path: Path, series: str | None = None, progress: Progress | None = None
                 slices += _read_slices(file, header)
         slices, step = _sort_slices(slices)
         first = slices[0]
-        quantity, factor = _quantity(str(headers[0][1].get("Modality")), first.unit)
+        quantity, factor = _quantity(str(headers[0][1].get("Modality")), first.values.code)
         rows, columns = first.shape
         require_voxels((columns, rows, len(slices)), np.dtype(np.float32))
         array = np.empty((columns, rows, len(slices)), np.float32)
         for k, (image, pixels) in enumerate(_read_pixels(slices)):
-            array[:, :, k] = (pixels.astype(np.float64) * image.slope + image.intercept).T * factor
+            array[:, :, k] = (pixels.astype(np.float64) * image.values.slope + image.values.intercept).T * factor
             tell(progress, k + 1, len(slices))
     axes = np.column_stack([*(first.orientation * np.array(first.spacing[::-1])[:, None]), step])
     return VolumeFileContents(array, RAS_FROM_LPS @ affine_matrix(axes, first.position), quantity, None, True)
@@ -128,7 +126,6 @@ def _quantity(modality: str, code: str) -> DicomUnit:
 def _read_headers(path: Path) -> list[tuple[Path, Any]]:
     """Read path and header of all images in the folder, or of a file's series, without pixels."""
     import pydicom
-    from pydicom.errors import InvalidDicomError
 
     files = sorted(path.iterdir()) if path.is_dir() else [path, *sorted(path.parent.iterdir())]
     series_uid = None  # of the file at `path`; None for a folder
@@ -137,16 +134,14 @@ def _read_headers(path: Path) -> list[tuple[Path, Any]]:
     for file in files:
         if file in headers or file.is_dir() or file.name.startswith("._"):  # ._NAME: a folder's data of macOS
             continue
-        try:
-            if not (is_dicom(require_file(file)) or file.suffix.lower() in (".dcm", ".ima") or _is_bare(file)):
-                continue
-            header = pydicom.dcmread(file, stop_before_pixels=True, force=_is_bare(file))
-        except InvalidDicomError:
-            raise InputError(f"{file.name} is no DICOM file") from None
-        except InputError as error:
-            raise InputError(f"{file.name}: {error}") from None
-        except Exception as error:  # whatever pydicom raises on a damaged file
-            raise InputError(f"{file.name} cannot be read as DICOM ({first_line(error)})") from None
+        with naming(file.name):
+            is_bare = _is_bare(require_file(file))
+        if not (is_bare or is_dicom(file)):
+            if file.suffix.lower() in (".dcm", ".ima"):
+                raise InputError(f"{file.name} is no DICOM file")
+            continue
+        with reading(file.name, "DICOM"):
+            header = pydicom.dcmread(file, stop_before_pixels=True, force=is_bare)
         if file == path:
             if "Rows" in header and (_is_whole_volume(header) or "PerFrameFunctionalGroupsSequence" in header):
                 return [(file, header)]
@@ -199,7 +194,7 @@ def _sop_class(header: Any) -> str:
     return str(header.file_meta.get("MediaStorageSOPClassUID") or header.get("SOPClassUID", ""))
 
 
-def _choose_series(headers: list[tuple[Path, Any]], path: Path, series: str | None) -> list[tuple[Path, Any]]:
+def _choose_series(headers: list[tuple[Path, Any]], series: str | None) -> list[tuple[Path, Any]]:
     """Return the headers of the series with this number, description or UID, or of the only series."""
     all_series: dict[str, list[tuple[Path, Any]]] = defaultdict(list)
     for file, header in headers:
@@ -235,38 +230,33 @@ def _read_slices(path: Path, header: Any) -> Iterator[_Slice]:
         spacing = _numbers(frame, "PixelSpacing", 2)
         if spacing.min() <= 0:
             raise InputError(f"PixelSpacing: expected more than 0 mm, got {spacing.min():g}")
-        slope, intercept, unit, *_ = _rescaling(header, frame)
         yield _Slice(
-            path=path,
-            frame=number,
-            shape=(int(header.Rows), int(header.Columns)),
-            spacing=(float(spacing[0]), float(spacing[1])),
-            orientation=_directions(frame),
-            position=_numbers(frame, "ImagePositionPatient", 3),
-            slope=slope,
-            intercept=intercept,
+            path, number, (int(header.Rows), int(header.Columns)), (float(spacing[0]), float(spacing[1])),
+            _directions(frame), _numbers(frame, "ImagePositionPatient", 3), _frame_values(header, frame),
             thickness=float(_numbers(frame, "SliceThickness", 1, 0.0)[0]),
-            unit=unit,
             is_rescaled=frame.get("RescaleSlope") is not None,
-        )
+        )  # fmt: skip
 
 
-def _rescaling(header: Any, frame: Any) -> RealWorldValues:
+def stated_rescaling(tags: Any, code: str) -> RealWorldValues:
+    """Return the rescaling to the unit `code` by Rescale Slope and Intercept, 1 and 0 where the `tags` have none."""
+    slope, intercept = (_numbers(tags, f"Rescale{x}", 1, y)[0] for x, y in (("Slope", 1.0), ("Intercept", 0.0)))
+    return RealWorldValues(float(slope), float(intercept), code)
+
+
+def _frame_values(header: Any, frame: Any) -> RealWorldValues:
     """Return slope, intercept and unit of a frame's values: those of its real world values, or else of its rescaling.
 
     `InputError` where both are to one quantity and give other values.
     """
-    slope, intercept = (float(_numbers(frame, f"Rescale{x}", 1, y)[0]) for x, y in (("Slope", 1.0), ("Intercept", 0.0)))
     code = str(header.get("Units") or frame.get("RescaleType") or "")
-    code = "HU" if header.get("Modality") == "CT" and code in _HOUNSFIELD else code
-    rescaling = RealWorldValues(slope, intercept, code)
-    mapped = real_world_values(frame) or real_world_values(header)
-    stated_unit, unit = unit_of(rescaling.code), unit_of(mapped.code) if mapped else None
-    if mapped is None or (unit is None and stated_unit is not None):
+    rescaling = stated_rescaling(frame, "HU" if header.get("Modality") == "CT" and code in _HOUNSFIELD else code)
+    mapped = real_world_values(frame) or real_world_values(header) or rescaling
+    stated_unit, unit = unit_of(rescaling.code), unit_of(mapped.code)
+    if unit is None and stated_unit is not None:
         return rescaling
     if unit and stated_unit and unit.quantity == stated_unit.quantity and not agree([rescaling, mapped]):
-        pair = f"{slope:g} x value + {intercept:g} {code}, RealWorldValueMapping {mapped.slope:g} x value"
-        raise InputError(f"its rescaling is {pair} + {mapped.intercept:g} {mapped.code}: expected one of them")
+        raise InputError(f"its rescaling is {rescaling}, RealWorldValueMapping {mapped}: expected one of them")
     return mapped
 
 
@@ -308,7 +298,7 @@ def _sort_slices(slices: list[_Slice]) -> tuple[list[_Slice], Floats]:
         for feature, is_same in (
             (f"{shape[1]} x {shape[0]} pixels", shape == first.shape),
             (f"pixels of {spacing[0]:g} x {spacing[1]:g} mm", np.allclose(spacing, first.spacing, 1e-4)),
-            (f"values in {image.unit or 'no stated unit'}", image.unit == first.unit),
+            (f"values in {image.values.code or 'no stated unit'}", image.values.code == first.values.code),
             ("a RescaleSlope" if image.is_rescaled else "no RescaleSlope", image.is_rescaled == first.is_rescaled),
             ("another orientation", np.allclose(image.orientation, first.orientation, atol=_SAME_ORIENTATION)),
         ):
@@ -318,7 +308,7 @@ def _sort_slices(slices: list[_Slice]) -> tuple[list[_Slice], Floats]:
     ras_normal = RAS_FROM_LPS[:3, :3] @ normal
     normal = normal * np.sign(ras_normal[np.abs(ras_normal).argmax()])
     slices = sorted(slices, key=lambda image: float(image.position @ normal))
-    first, last = slices[0], slices[-1]
+    first = slices[0]
     if len(slices) == 1:
         if not first.thickness > 0:
             raise InputError(f"{first.name}: a single slice without a SliceThickness")
@@ -344,15 +334,13 @@ def _sort_slices(slices: list[_Slice]) -> tuple[list[_Slice], Floats]:
     if median > 1.5 * first.thickness > 0:
         text = f"the slices are {first.thickness:g} mm thick and lie {median:g} mm apart: there are gaps between them, "
         warn(f"{text}or some are missing")
-    step = (last.position - first.position) / (len(slices) - 1)
     offsets = positions - first.position
-    sideways = offsets - np.outer(offsets @ normal, normal)
     fractions = (heights - heights[0]) / (heights[-1] - heights[0])
-    deviations = np.linalg.norm(sideways - np.outer(fractions, sideways[-1]), axis=1)
+    deviations = np.linalg.norm(offsets - np.outer(fractions, offsets[-1]), axis=1)
     if deviations.max() > 0.1 * min(first.spacing):
         worst = slices[int(deviations.argmax())]
         raise InputError(f"{worst.name} lies {deviations.max():.3g} mm beside the other slices")
-    return slices, step
+    return slices, offsets[-1] / (len(slices) - 1)
 
 
 def _decimals(number: float) -> int:

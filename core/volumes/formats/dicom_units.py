@@ -4,6 +4,8 @@ import math
 import re
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from ...errors import InputError
 
 _PREFIXES = {"": 1e-3, "k": 1.0, "M": 1e3, "G": 1e6}  # kBq for each of these Bq
@@ -44,6 +46,9 @@ class RealWorldValues(NamedTuple):
     last: float = math.inf
     """Largest stored value that is mapped."""
 
+    def __str__(self) -> str:
+        return f"{self.slope:g} x value + {self.intercept:g} {self.code}"
+
 
 def real_world_values(header: Any) -> RealWorldValues | None:
     """Return the rescaling of a header or frame by RealWorldValueMappingSequence; None where it has none.
@@ -58,28 +63,17 @@ def real_world_values(header: Any) -> RealWorldValues | None:
         slope, intercept = float(item.RealWorldValueSlope), float(item.get("RealWorldValueIntercept") or 0)
         if not (math.isfinite(slope) and slope != 0 and math.isfinite(intercept)):
             raise InputError(f"RealWorldValueSlope: expected a number other than 0, got {slope:g}")
-        limits = (item.get(f"RealWorldValue{name}ValueMapped") for name in ("First", "Last"))
-        first, last = (
-            x if limit is None else float(limit) for limit, x in zip(limits, (-math.inf, math.inf), strict=True)
-        )
-        maps.append(RealWorldValues(slope, intercept, codes[0] if codes else "", first, last))
+        first, last = (item.get(f"RealWorldValue{name}ValueMapped") for name in ("First", "Last"))
+        limits = -math.inf if first is None else float(first), math.inf if last is None else float(last)
+        maps.append(RealWorldValues(slope, intercept, codes[0] if codes else "", *limits))
     known_maps = [mapping for mapping in maps if unit_of(mapping.code)] or maps
-    quantities = {unit.quantity for mapping in known_maps if (unit := unit_of(mapping.code))}
-    if len(set(known_maps)) > 1:
-        listed = "; ".join(
-            f"{mapping.slope:g} x value + {mapping.intercept:g} {mapping.code}" for mapping in known_maps
-        )
-        if len(quantities) > 1 or not agree(known_maps):
-            raise InputError(f"RealWorldValueMapping: {listed}; expected one of them")
+    if known_maps and not agree(known_maps):
+        raise InputError(f"RealWorldValueMapping: {'; '.join(map(str, known_maps))}; expected one of them")
     return known_maps[0] if known_maps else None
 
 
 def agree(maps: list[RealWorldValues]) -> bool:
-    """Return whether maps to units of one quantity give the same values."""
-    factors = [unit.factor if (unit := unit_of(mapping.code)) else 1.0 for mapping in maps]
-    values = [
-        (mapping.slope * factor, mapping.intercept * factor) for mapping, factor in zip(maps, factors, strict=True)
-    ]
-    return all(
-        math.isclose(a, b, rel_tol=1e-6, abs_tol=1e-12) for row in values for a, b in zip(row, values[0], strict=True)
-    )
+    """Return whether maps are to one quantity, or all to unknown ones, and give the same values."""
+    units = [unit_of(mapping.code) or DicomUnit("", 1.0) for mapping in maps]
+    values = [np.multiply(mapping[:2], unit.factor) for mapping, unit in zip(maps, units, strict=True)]
+    return len({unit.quantity for unit in units}) == 1 and np.allclose(values, values[0], rtol=1e-6, atol=1e-12)

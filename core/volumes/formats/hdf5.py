@@ -43,6 +43,5 @@ def write_datasets(volume: Volume, file: Any) -> None:
     """Write the volume's datasets into the root of an open ``h5py.File``."""
     array = file.create_dataset("array", data=volume.array, compression="gzip", compression_opts=1, shuffle=True)
     array.attrs.update(quantity=volume.quantity, unit=volume.unit, **({"note": volume.note} if volume.note else {}))
-    file.create_dataset("affine", data=volume.grid.affine).attrs.update(
-        unit="mm", description="index to world, on column vectors; an integer index is a voxel's centre"
-    )
+    description = "index to world, on column vectors; an integer index is a voxel's centre"
+    file.create_dataset("affine", data=volume.grid.affine).attrs.update(unit="mm", description=description)

@@ -24,7 +24,6 @@ _TYPES = {
 _MILLIMETRES = {"mm": 1.0, "cm": 10.0, "um": 0.001, "?": 1.0}
 _SPACINGS, _OFFSETS = ("ElementSpacing", "ElementSize"), ("Offset", "Position", "Origin")
 _MATRICES = ("TransformMatrix", "Rotation", "Orientation")
-_OF_AXES = (*_SPACINGS, *_OFFSETS, *_MATRICES)
 _LONGEST_HEADER = 1 << 16
 
 
@@ -35,12 +34,6 @@ def read(path: Path) -> VolumeFileContents:
         sizes = _numbers(header, ("DimSize",), None)
         if len(sizes) == 4 and sizes[3] == 1:  # one volume
             sizes = sizes[:3]
-            for key, value in header.items():
-                words = value.split()
-                if len(words) in (4, 16) and key in _OF_AXES:
-                    header[key] = " ".join(
-                        words[row * 4 + axis] for row in range(max(1, len(words) // 5)) for axis in range(3)
-                    )
         if not (sizes == np.floor(sizes)).all():
             raise InputError(f"DimSize = {header['DimSize']}: expected whole numbers")
         shape = tuple(int(n) for n in sizes)
@@ -139,6 +132,8 @@ def _numbers(header: dict[str, str], keys: tuple[str, ...], default: Floats | No
         return default
     with expecting(f"{keys[0]} = {text}: expected numbers"):
         numbers = np.array(text.split(), np.float64)
+    if default is not None and len(header["DimSize"].split()) == 4 and len(numbers) in (4, 16):
+        numbers = numbers.reshape(-1, 4)[:3, :3].ravel()  # those of the first three axes
     if default is not None and len(numbers) != len(default):
         raise InputError(f"{keys[0]} = {text}: expected {len(default)} numbers")
     return numbers

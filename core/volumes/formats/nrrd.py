@@ -89,9 +89,7 @@ def _single_axis(header: dict[str, Any]) -> int | None:
     axis = max(range(4), key=lambda axis: (sizes[axis] == 1, kinds[axis] not in _SPATIAL, axis))
     for name in ("sizes", "kinds", "spacings", "axis mins", "axis maxs", "centerings", "units", "space directions"):
         if len(values := header.get(name, ())) == 4:
-            header[name] = np.delete(np.asarray(values), axis, axis=0) if name != "kinds" else [
-                kind for index, kind in enumerate(values) if index != axis
-            ]  # fmt: skip
+            header[name] = np.delete(np.asarray(values), axis, axis=0)
     return axis
 
 
@@ -159,11 +157,9 @@ def _space_axes(header: dict[str, Any], directions: np.ndarray) -> np.ndarray:
     """
     if directions.shape != (3, 3) or not np.isfinite(directions).all():
         raise InputError("space directions: expected a vector for each of three axes")
-    if any(np.isfinite(_numbers(header, name)).any() for name in ("axis mins", "axis maxs")):
+    if any(_numbers(header, name) is not None for name in ("axis mins", "axis maxs")):
         raise InputError("axis mins or axis maxs beside space directions: expected space origin alone")
-    spacings, lengths = _numbers(header, "spacings"), np.linalg.norm(directions, axis=1)
-    if np.any(np.abs(spacings - lengths) > _SAME * lengths):
-        raise InputError(f"spacings and space directions say different lengths: {_text(spacings)} and {_text(lengths)}")
+    _spacings(header, np.linalg.norm(directions, axis=1), "space directions")
     return directions.T
 
 
@@ -173,54 +169,54 @@ def _axis_positions(header: dict[str, Any]) -> tuple[np.ndarray, np.ndarray | No
     On a cell-centred axis, "axis mins" and "axis maxs" are the outer faces of the first and last voxel; on a node-centred
     axis, they are these voxels' centres.
     """
-    spacings, low, high = (_numbers(header, name) for name in ("spacings", "axis mins", "axis maxs"))
-    assumptions: list[str] = []
-    if not np.isfinite(low).any():
-        if np.isfinite(high).any():
+    low, high = (_numbers(header, name) for name in ("axis mins", "axis maxs"))
+    if low is None:
+        if high is not None:
             raise InputError("axis maxs: expected axis mins beside them")
-        if np.isfinite(spacings).any():
-            return _require_finite(spacings, "spacings"), None, assumptions
-        return np.ones(3), None, ["voxels of 1 mm"]
-    low = _require_finite(low, "axis mins")
+        spacings = _spacings(header)
+        return (np.ones(3), None, ["voxels of 1 mm"]) if spacings is None else (spacings, None, [])
     centerings = header.get("centerings", ["???"] * 3)
     centerings = [c.lower() for c in (centerings.split() if isinstance(centerings, str) else centerings)]
     if len(centerings) != 3 or not set(centerings) <= {"cell", "node", "none", "???"}:
         raise InputError(f"centerings {' '.join(centerings)}: expected cell or node for each of three axes")
-    if not set(centerings) <= {"cell", "node"}:
-        assumptions = ["axis mins at the first voxel's face (centerings: cell)"]
+    assumptions = ["axis mins at the first voxel's face (centerings: cell)"] * (not set(centerings) <= {"cell", "node"})
     is_node = np.array([c == "node" for c in centerings])
-    if np.isfinite(high).any():
+    steps = None
+    if high is not None:
         n_steps = np.asarray(header["sizes"]) - is_node
         if np.any(n_steps < 1):
             raise InputError("axis maxs: an axis of one node has no spacing; expected spacings and axis mins")
-        steps = (_require_finite(high, "axis maxs") - low) / n_steps
-        if np.any(np.abs(spacings - steps) > _SAME * np.abs(steps)):
-            lengths = f"{_text(spacings)} and {_text(steps)}"
-            raise InputError(f"spacings and axis mins and maxs say different lengths: {lengths}")
-        spacings = steps
-    spacings = _require_finite(spacings, "spacings")
+        steps = (high - low) / n_steps
+    if (spacings := _spacings(header, steps, "axis mins and maxs")) is None:
+        raise InputError("axis mins: expected spacings or axis maxs beside them")
     return spacings, low + np.where(is_node, 0.0, spacings / 2), assumptions
 
 
-def _numbers(header: dict[str, Any], name: str) -> np.ndarray:
-    """Return the three numbers of a field, NaN for missing ones."""
-    numbers = np.asarray(header.get(name, [np.nan] * 3), np.float64)
-    if numbers.shape != (3,):
-        raise InputError(f"{name}: expected 3 numbers, got {_text(np.atleast_1d(numbers))}")
-    return numbers
+def _spacings(header: dict[str, Any], steps: np.ndarray | None = None, source: str = "") -> np.ndarray | None:
+    """Return `steps`, the axes' spacings (3,) that follow from other fields, the `source`; if None, the field "spacings".
+
+    `InputError` where both are stated and differ.
+    """
+    if (spacings := _numbers(header, "spacings")) is None or steps is None:
+        return spacings if steps is None else steps
+    if np.any(np.abs(spacings - steps) > _SAME * np.abs(steps)):
+        raise InputError(f"spacings and {source} say different lengths: {_text(spacings)} and {_text(steps)}")
+    return steps
 
 
-def _require_finite(numbers: np.ndarray, name: str) -> np.ndarray:
-    """Return the three numbers of the field `name`, or raise `InputError` if one is missing."""
-    if not np.isfinite(numbers).all():
+def _numbers(header: dict[str, Any], name: str) -> np.ndarray | None:
+    """Return the three numbers of a field, or None if they are missing or NaN."""
+    numbers = np.asarray(header.get(name, np.nan), np.float64)
+    if np.isnan(numbers).all():
+        return None
+    if numbers.shape != (3,) or not np.isfinite(numbers).all():
         raise InputError(f"{name}: expected 3 numbers, got {_text(numbers)}")
     return numbers
 
 
 def _unit_lengths(header: dict[str, Any], name: str) -> np.ndarray | None:
     """Return the three units of length of a field, mm, or None if the field is missing."""
-    units = header.get(name)
-    if units is None:
+    if (units := header.get(name)) is None:
         return None
     if len(units) != 3 or any(unit.strip() not in _MILLIMETRES for unit in units):
         raise InputError(f"{name} {' '.join(units)}: expected mm, cm, m or um for each of three axes")

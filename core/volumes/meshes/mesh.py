@@ -69,12 +69,9 @@ def read_mesh(path: AnyPath, unit: str | None = None) -> Mesh:
         content = require_file(path).read_bytes()
         if suffix == ".obj":  # trimesh takes a comment behind a face for corners, and no lines that end with CR alone
             content = re.sub(rb"#[^\r\n]*", b"", content).replace(b"\r", b"\n")
-            if re.search(
-                rb"^f[^\n]*[ \t]-.*\nv[ \t]", content, re.MULTILINE | re.DOTALL
-            ):  # it counts from the file's end
-                raise InputError(
-                    "faces with relative indices stand before further vertices: export it with absolute ones"
-                )
+            # It counts relative indices from the file's last vertex, not from the face's.
+            if re.search(rb"^f[^\n]*[ \t]-.*\nv[ \t]", content, re.MULTILINE | re.DOTALL):
+                raise InputError("faces with relative indices stand before further vertices: export absolute ones")
         elif suffix == ".glb":
             _require_plain_gltf(content)
         elif suffix == ".stl":
@@ -89,13 +86,9 @@ def _require_plain_gltf(content: bytes) -> None:
     unknown = [name for name in header.get("extensionsRequired", ()) if not name.startswith(_LOOKS)]
     meshes, accessors = header.get("meshes", ()), header.get("accessors", ())
     primitives = [primitive for mesh in meshes for primitive in mesh.get("primitives", ())]
-    used = [
-        accessors[i] for p in primitives for i in (p["attributes"].get("POSITION"), p.get("indices")) if i is not None
-    ]
-    weights = [
-        *(mesh.get("weights", ()) for mesh in meshes),
-        *(node.get("weights", ()) for node in header.get("nodes", ())),
-    ]
+    indices = [index for p in primitives for index in (p["attributes"].get("POSITION"), p.get("indices"))]
+    used = [accessors[index] for index in indices if index is not None]
+    weights = [item.get("weights", ()) for item in (*meshes, *header.get("nodes", ()))]
     for problem, is_there in (
         (f"it requires {', '.join(unknown)}", unknown),
         ("its positions are quantized", any(a["type"] == "VEC3" and a["componentType"] != _FLOAT for a in used)),

@@ -77,9 +77,8 @@ def _triangles(
     The key of an edge is 8 times the flat index of its lower end, plus the number of the cube's corner in its direction; the
     fraction, 0 to 1, is the position on the edge. `first` is the flat index of the lower plane's first voxel.
     """
-    values = np.stack(
-        [plane[y : y - 1 or None, z : z - 1 or None] for plane in (below, above) for y in (0, 1) for z in (0, 1)]
-    )
+    corners = [(plane, y, z) for plane in (below, above) for y, z in np.ndindex(2, 2)]
+    values = np.stack([plane[y : y - 1 or None, z : z - 1 or None] for plane, y, z in corners])
     inside = values >= level
     j, k = np.nonzero(inside.any(axis=0) & ~inside.all(axis=0))
     values, inside = values[:, j, k], inside[:, j, k]

@@ -1,6 +1,6 @@
 """Contact sheet of events, one per row: slices of the truth, images of all modules, a Radon view, a sinogram."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -149,7 +149,7 @@ def _slice_panels(row: SheetRow) -> list[_Panel]:
     grid, array = row.truth.grid, row.truth.array
     display = Display("inferno" if row.truth.quantity == "activity" else "grey")
     window = 0.0, _upper_limit(array[array > 0])
-    index = _slice_indices(row)
+    index = list(_slice_indices(row))
     point = (grid.affine @ [*index, 1.0])[:3]
     extent = grid.spacing * grid.shape
     scale = _SIDE / float(extent.max())
@@ -166,21 +166,19 @@ def _slice_panels(row: SheetRow) -> list[_Panel]:
     return panels
 
 
-def _slice_indices(row: SheetRow) -> list[int]:
-    """Return the index of the slice along each axis: the one nearest to the row's centre with enough contrast.
+def _slice_indices(row: SheetRow) -> Iterator[int]:
+    """Yield the index of the slice along each axis: the one nearest to the row's centre with enough contrast.
 
     Contrast is the standard deviation of a slice; enough is 80 % of the largest within `_SEARCH` of the grid's side.
     """
     grid, array = row.truth.grid, row.truth.array
     center_index = np.rint((grid.index_from_world @ [*row.center, 1.0])[:3]).astype(int)
-    indices = []
     for axis, n in enumerate(grid.shape):
         center, reach = int(np.clip(center_index[axis], 0, n - 1)), round(_SEARCH * n)
         candidates = list(range(max(0, center - reach), min(n, center + reach + 1)))
         contrasts = [float(array.take(i, axis).std()) for i in candidates]
         promising = [i for i, s in zip(candidates, contrasts, strict=True) if s >= 0.8 * max(contrasts)]
-        indices.append(min(promising, key=lambda i: abs(i - center)))
-    return indices
+        yield min(promising, key=lambda i: abs(i - center))
 
 
 def _central_part(images: Floats32, fraction: float) -> Floats32:

@@ -141,11 +141,10 @@ def _overlaps(layers: Sequence[Layer], number: int) -> dict[int, float]:
     return {k: n / max(n_points, 1) for k, n in n_overlapping.items()}
 
 
-def _visible_layers(layers: Sequence[Layer]) -> list[list[Layer]]:
-    """Return for each layer the layers beneath it that may be visible inside its shape; none for a layer that adds."""
+def _visible_layers(layers: Sequence[Layer]) -> Iterator[list[Layer]]:
+    """Yield for each layer the layers beneath it that may be visible inside its shape; none for a layer that adds."""
     centers = np.array([layer.pose[:3, 3] for layer in layers]).reshape(-1, 3)
     radii = np.array([layer.shape.ball_radius * np.linalg.norm(layer.pose[:3, :3], 2) for layer in layers])
-    result = []
     for i, layer in enumerate(layers):
         near = np.linalg.norm(centers[:i] - centers[i], axis=1) < radii[:i] + radii[i]
         visible: list[Layer] = []
@@ -155,8 +154,7 @@ def _visible_layers(layers: Sequence[Layer]) -> list[list[Layer]]:
                 visible = []
             if relation >= 0:
                 visible.append(layers[j])
-        result.append(visible)
-    return result
+        yield visible
 
 
 def paint_voxels(

@@ -2,7 +2,7 @@
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from functools import cached_property
 from typing import Any
 
@@ -95,12 +95,10 @@ class CardiacTorso(Phantom):
         for i, organ in enumerate(organs):
             points = next(points_inside(Layer(organ, organ.pose, 0.0))) - body.pose[:3, 3:]
             if np.any(body.distance(points) > 0):
-                settings = (
-                    f"body radii of {self.body_radii[0]:g} and {self.body_radii[1]:g} mm"
-                    if i < _N_FIXED
-                    else f"ventricle length of {self.ventricle_length:g} mm, wall of {self.wall:g} mm and end diastolic "
-                    f"volume of {self.end_diastolic_volume:g} mL"
-                )
+                settings = "body radii of {:g} and {:g} mm".format(*self.body_radii)
+                if i >= _N_FIXED:
+                    lengths = f"ventricle length of {self.ventricle_length:g} mm, wall of {self.wall:g} mm"
+                    settings = f"{lengths} and end diastolic volume of {self.end_diastolic_volume:g} mL"
                 raise InputError(f"{self.title}: {settings}: the {organ.name} reaches out of the body")
 
     def beating(self, frames: int) -> "list[CardiacTorso]":
@@ -187,24 +185,22 @@ class CardiacTorso(Phantom):
             apical_half("left ventricle", radius, radius, length, **blood),
         ]
 
-    def _defect_planes(self, length: float) -> list[list[tuple[float, float, float, float]]]:
-        """Return the planes (nx, ny, nz, d) that bound each convex piece of the defect, in the heart's frame, d in mm.
+    def _defect_planes(self, length: float) -> Iterator[list[tuple[float, float, float, float]]]:
+        """Yield the planes (nx, ny, nz, d) that bound each convex piece of the defect, in the heart's frame, d in mm.
 
         A defect of up to 180 degrees is one piece, a wider one two. `length` is the distance from base to apex, mm.
         """
         if not self.defect_severity:
-            return []
+            return
         ends = [(0.0, 0.0, -1.0, -self.defect_from * length), (0.0, 0.0, 1.0, self.defect_to * length)]
         n_pieces = 1 if self.defect_width_degrees <= 180 else 2
         half_width = math.radians(self.defect_width_degrees) / n_pieces / 2
         defect_angle = math.radians(self.defect_angle_degrees)
-        pieces = []
         for piece in range(n_pieces):
             angle = defect_angle + (2 * piece - (n_pieces - 1)) * half_width
             # Angles run from anterior (y) to lateral (x). The outward normal of an edge is a quarter turn beyond the edge.
             normals = angle - half_width - math.pi / 2, angle + half_width + math.pi / 2
-            pieces.append([(math.sin(a), math.cos(a), 0.0, 0.0) for a in normals] + ends)
-        return pieces
+            yield [(math.sin(a), math.cos(a), 0.0, 0.0) for a in normals] + ends
 
 
 def _half_ellipsoid_radius(volume: float, length: float) -> float:

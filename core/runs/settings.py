@@ -7,7 +7,7 @@ same name in the model's class.
 
 import dataclasses
 import functools
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from types import MappingProxyType
 from typing import Any
 
@@ -311,18 +311,16 @@ SETTINGS: Mapping[str, Setting] = MappingProxyType({row.key: _with_table_needs(r
 """Settings by their keys, table by table; `settings_with` adds the settings of a kind of phantom."""
 
 
-def phantom_settings(name: str, row: type[Setting] = UncheckedSetting, **details: Any) -> list[Setting]:
-    """Return the settings of the kind of phantom of that name, one for each field of its class, as rows of class `row`.
+def phantom_settings(name: str, row: type[Setting] = UncheckedSetting, **details: Any) -> Iterator[Setting]:
+    """Yield the settings of the kind of phantom of that name, one for each field of its class, as rows of class `row`.
 
     There are none for an unknown name. `details` are further attributes of all rows.
     """
-    settings = []
     for kind in KINDS:
         fields = {field.name: field for field in dataclasses.fields(kind.phantom)} if kind.name == name else {}
         for key, field in setting_names(kind.phantom).items() if fields else ():
             default, text = kind.usual.get(field, fields[field].default), fields[field].metadata.get("text", "")
-            settings.append(default_setting(key, default, text, row, **details))
-    return settings
+            yield default_setting(key, default, text, row, **details)
 
 
 @functools.cache

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 from collections import Counter
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -71,13 +72,12 @@ def _summary(event_set: events.EventSet) -> str:
     return "   ·   ".join(filter(None, texts))
 
 
-def _table(rows: list[dict[str, Any]]) -> list[str]:
-    """Return a line of text for each event, below a heading."""
+def _table(rows: list[dict[str, Any]]) -> Iterator[str]:
+    """Yield a line of text for each event, below a heading."""
     names = max(7, *(len(str(row["phantom"])) for row in rows))
     splits = max(5, *(len(row["split"] or "") for row in rows))
     titles = "".join(f"{text:>9}" for text in ("x mm", "y mm", "z mm", "phi °", "theta °", "psi °"))
-    lines = [f"{'event':>6}  {'phantom':<{names}}  {'split':<{splits}}{titles}"]
+    yield f"{'event':>6}  {'phantom':<{names}}  {'split':<{splits}}{titles}"
     for row in rows:
         numbers = "".join(f"{row[column]:9.2f}" for column in _COLUMNS)
-        lines.append(f"{row['event']:6d}  {row['phantom']:<{names}}  {row['split'] or '':<{splits}}{numbers}")
-    return lines
+        yield f"{row['event']:6d}  {row['phantom']:<{names}}  {row['split'] or '':<{splits}}{numbers}"

@@ -5,6 +5,7 @@ into H. Kuhn's six tetrahedra, in the same way in all cubes. The surface is ther
 of marching cubes do not guarantee. A compiled library would be faster, but one more wheel for every platform.
 """
 
+from collections.abc import Iterator
 from itertools import permutations
 
 import numpy as np
@@ -70,8 +71,8 @@ def _padded_plane(array: Floats32, i: int, outside: float) -> Floats:
 
 def _triangles(
     below: Floats, above: Floats, level: float, first: int, strides: Integers
-) -> list[tuple[Integers, Floats]]:
-    """Return triangles between two planes of values, in groups: keys (N, 3) of their corners' edges, and fractions (N, 3).
+) -> Iterator[tuple[Integers, Floats]]:
+    """Yield triangles between two planes of values, in groups: keys (N, 3) of their corners' edges, and fractions (N, 3).
 
     The key of an edge is 8 times the flat index of its lower end, plus the number of the cube's corner in its direction; the
     fraction, 0 to 1, is the position on the edge. `first` is the flat index of the lower plane's first voxel.
@@ -82,7 +83,6 @@ def _triangles(
     j, k = np.nonzero(inside.any(axis=0) & ~inside.all(axis=0))
     values, inside = values[:, j, k], inside[:, j, k]
     corner = first + j * strides[1] + k * strides[2] + (_CORNERS @ strides)[:, None]
-    groups = []
     for tetrahedron, is_mirrored in zip(_TETRAHEDRA, _IS_MIRRORED, strict=True):
         case = (1 << np.arange(4)) @ inside[tetrahedron]
         for number, triangles in _CASES.items():
@@ -92,8 +92,7 @@ def _triangles(
                 low, high = ends.min(axis=1), ends.max(axis=1)
                 start, stop = values[low][:, cubes], values[high][:, cubes]
                 keys = corner[low][:, cubes] * 8 + (high - low)[:, None]
-                groups.append((keys.T, ((level - start) / (stop - start)).T))
-    return groups
+                yield keys.T, ((level - start) / (stop - start)).T
 
 
 def _make_cases() -> dict[int, list[list[tuple[int, int]]]]:

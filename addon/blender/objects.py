@@ -24,11 +24,11 @@ def world_matrix(item: bpy.types.Object) -> NDArray[np.float64]:
         return _as_typed(item.matrix_world)
     if item.parent is None and not any(item.delta_location):
         return _as_typed(item.matrix_basis)
-    own = np.array(item.matrix_basis, dtype=np.float64)
-    own[:3, 3] = [
+    basis = np.array(item.matrix_basis, dtype=np.float64)
+    basis[:3, 3] = [
         decimals.typed(x) + decimals.typed(delta) for x, delta in zip(item.location, item.delta_location, strict=True)
     ]
-    return _as_typed(_parent_matrix(item) @ own)
+    return _as_typed(_parent_matrix(item) @ basis)
 
 
 def _as_typed(matrix: Any) -> NDArray[np.float64]:

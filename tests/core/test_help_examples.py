@@ -66,6 +66,9 @@ def inputs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     mph.write_volume(ct, folder / "ct.nii.gz")
     mph.write_volume(mph.Volume(np.where(body > 0, 0.015, 0.0).astype(np.float32), grid, "mu"), folder / "ct-mu.nii.gz")
     write_series(ct, folder / "dicom_folder")
+    mph.write_volume(ct, folder / "ct.dcm")
+    (folder / "ct.dcm").rename(folder / "ct")
+    mph.write_volume(mph.Volume(np.maximum(body, 0), grid, "activity"), folder / "osem.nii.gz")
     for name, radius in (("body", 60.0), ("heart", 20.0)):
         small = mph.Grid.centered((20, 20, 20), radius / 8)
         ball = mph.Volume((np.hypot(*np.indices(small.shape)[:2] - 9.5) < 6).astype(np.float32), small, "mu")

@@ -54,7 +54,7 @@ def add_stored(stored: StoredVolume, name: str, collection: bpy.types.Collection
     return item
 
 
-def _check_voxel_size(name: str, spacing: ArrayLike) -> None:
+def _check_voxel_size(name: str, spacing: NDArray[np.floating]) -> None:
     """Warn of voxels below a micrometre, as of meshes that were made in metres."""
     if np.min(spacing) < _MICROMETER:
         advice = "a unit of the scene is 1 mm, so scale by 1000 what was made in metres"

@@ -21,7 +21,9 @@ class MPHDRR_OT_export_volume(jobs.ExportJob, bpy.types.Operator):
         description="DICOM file of which a .dcm takes the tags of patient, study and series",
         subtype="FILE_PATH",
     )
-    tags: StringProperty(name="Tags", description="Such tags for a .dcm: PatientName=Doe^Jo; SeriesDescription=OSEM")
+    tags: StringProperty(
+        name="Tags", description="Tags of patient, study, series for .dcm: PatientName=Doe^Jo; StudyID=7"
+    )
 
     poll = reports.needs(volumes.ACTIVE)
 

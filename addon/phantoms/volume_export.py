@@ -7,7 +7,7 @@ import bpy
 
 from ...core.errors import InputError
 from ...core.progress import Progress, stages_of
-from ...core.volumes.formats.dicom_writing import tags_of
+from ...core.volumes.formats.dicom_writing import parse_tags
 from ...core.volumes.volume_files import VOLUME_FORMATS, write_volume
 from ..blender import jobs
 from ..volumes import vdb, volumes
@@ -25,7 +25,7 @@ def export_job(item: bpy.types.Object, path: Path, template: str = "", tags: str
     if not path.name.lower().endswith(WRITTEN_ENDINGS):
         raise InputError(f"{path}: expected a name ending in {', '.join(WRITTEN_ENDINGS)}")
     read = volumes.reader(item)
-    dicom: dict[str, Any] = {"template": template or None, "tags": tags_of(tags.split(";"))}
+    dicom: dict[str, Any] = {"template": template or None, "tags": parse_tags(tags.split(";"))}
     if path.resolve() == volumes.file_of(item).resolve():
         raise InputError(f"{path}: is the scene's own file of {item.name!r}; choose another name")
     phantoms.require_current(item)

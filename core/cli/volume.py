@@ -9,7 +9,7 @@ from ... import core as mph
 from ..geometry.grid import grid_around
 from ..physics.isotopes import photon_energy
 from ..validation import positive, real_array, shape_text
-from ..volumes.formats.dicom_writing import tags_of
+from ..volumes.formats.dicom_writing import parse_tags
 from ..volumes.meshes.mesh import MESH_FORMATS, MILLIMETRES
 from ..volumes.volume import UNITS
 from ..volumes.volume_files import VOLUME_FORMATS
@@ -48,7 +48,7 @@ def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
     convert.add_argument("-o", "--output", required=True, metavar="FILE", help=", ".join(VOLUME_FORMATS))
     template = "DICOM file of which .dcm takes the tags of patient, study and series"
     convert.add_argument("--template", metavar="FILE", help=template)
-    tag = "such a tag, as PatientName=Doe^Jo; may be repeated"
+    tag = "tag of patient, study or series for .dcm, as PatientName=Doe^Jo; may be repeated"
     convert.add_argument("--tag", action="append", default=[], metavar="KEYWORD=VALUE", help=tag)
 
     from_mesh = add_run(actions, "from-mesh", _from_mesh)
@@ -145,7 +145,7 @@ def _convert(arguments: argparse.Namespace) -> None:
         volume = mph.mu_to_hu(volume, photon_energy(arguments.from_mu))
     if arguments.to_mu:
         volume = mph.hu_to_mu(volume, energy)
-    mph.write_volume(volume, path, template=arguments.template, tags=tags_of(arguments.tag))
+    mph.write_volume(volume, path, template=arguments.template, tags=parse_tags(arguments.tag))
     print(f"{path}: {describe_volume(volume)} {volume.unit}")
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from ..errors import InputError, naming
 from ..files import AnyPath, replacing, require_ending
 from ..physics.isotopes import isotope
-from ..volumes.formats.dicom_writing import add_pixels, decimals, described, save, tagged, to_16_bits
+from ..volumes.formats.dicom_writing import add_pixels, decimals, new_header, save_image, set_tags, to_16_bits
 from .run import ProjectionRun
 
 
@@ -37,16 +37,16 @@ def write_counts(
                 raise InputError(f"expected one {item} for all modules: DICOM has one for all detectors")
         images = run.projections[:, ::-1, ::-1] if run.settings["detector"] == "virtual" else run.projections
         stored, slope = to_16_bits(images.T, 1.0)
-        data = described("NM", template, tags or {})
+        data = new_header("NM", template, tags or {})
         add_pixels(data, stored, slope, steps[0], "{counts}", "counts")
         nuclide, window, energies = _stated(run, "isotope"), _stated(run, "window"), []
         if nuclide or window:
             low, high = decimals(window or isotope(nuclide).window)
-            limits = tagged(None, EnergyWindowLowerLimit=low, EnergyWindowUpperLimit=high)
-            energies = [tagged(None, EnergyWindowRangeSequence=[limits])]
+            limits = set_tags(None, EnergyWindowLowerLimit=low, EnergyWindowUpperLimit=high)
+            energies = [set_tags(None, EnergyWindowRangeSequence=[limits])]
         place = {"ImagePositionPatient": None, "ImageOrientationPatient": None}
-        detectors = [tagged(None, CollimatorType="PINH", FocalDistance=None, **place) for _ in stored]
-        tagged(
+        detectors = [set_tags(None, CollimatorType="PINH", FocalDistance=None, **place) for _ in stored]
+        set_tags(
             data, ImageType=["DERIVED", "PRIMARY", "STATIC", "EMISSION"], NumberOfFrames=len(stored),
             FrameIncrementPointer=[0x00540010, 0x00540020], EnergyWindowVector=[1] * len(stored), NumberOfEnergyWindows=1,
             DetectorVector=list(range(1, len(stored) + 1)), NumberOfDetectors=len(stored), ActualFrameDuration=milliseconds,
@@ -55,7 +55,7 @@ def write_counts(
         )  # fmt: skip
         del data.RotationInformationSequence
         with replacing(path) as temporary:
-            save(data, 1, stored, temporary)
+            save_image(data, 1, stored, temporary)
 
 
 def _stated(run: ProjectionRun, name: str) -> Any:

@@ -59,18 +59,18 @@ def write(volume: Volume, path: Path, template: AnyPath | None = None, tags: Map
         axes, array = axes * [1, 1, -1], array[:, :, ::-1]
     kind, factor, code, meaning = _TOMOGRAMS.get(volume.quantity, ("AXIAL", 1.0, "HU", ""))
     stored, slope = to_16_bits(array, factor)
-    header = described("CT" if code == "HU" else "NM", template, tags or {})
+    header = new_header("CT" if code == "HU" else "NM", template, tags or {})
     add_pixels(header, stored, slope, spacing, code, meaning)
-    tagged(header, SliceThickness=decimals(spacing[2:])[0], **({"ImageComments": volume.note} if volume.note else {}))
+    set_tags(header, SliceThickness=decimals(spacing[2:])[0], **({"ImageComments": volume.note} if volume.note else {}))
     places = [_place(position + k * spacing[2] * axes[:, 2], axes) for k in range(len(stored))]
     if volume.quantity == "hu":
-        tagged(header, ImageType=["DERIVED", "SECONDARY", kind], RescaleType=code)
+        set_tags(header, ImageType=["DERIVED", "SECONDARY", kind], RescaleType=code)
         with new_folder(path) as folder:
             for k, (pixels, place) in enumerate(zip(stored, places, strict=True), 1):
-                save(tagged(header, **place), k, pixels, folder / f"{k:04d}.dcm")
+                save_image(set_tags(header, **place), k, pixels, folder / f"{k:04d}.dcm")
         return
-    detector = tagged(None, CollimatorType="UNKN", FocalDistance=None, **places[0])
-    tagged(
+    detector = set_tags(None, CollimatorType="UNKN", FocalDistance=None, **places[0])
+    set_tags(
         header, ImageType=["DERIVED", "PRIMARY", "RECON TOMO", kind], NumberOfFrames=len(stored),
         NumberOfSlices=len(stored), SliceVector=list(range(1, len(stored) + 1)), FrameIncrementPointer=0x00540080,
         SpacingBetweenSlices=decimals(spacing[2:])[0], NumberOfEnergyWindows=1, NumberOfDetectors=1, NumberOfRotations=1,
@@ -79,7 +79,7 @@ def write(volume: Volume, path: Path, template: AnyPath | None = None, tags: Map
     if len(header.RotationInformationSequence) > 1:  # a tomogram is of one rotation (C.8.4.8.1.5)
         header.RotationInformationSequence = []
     with replacing(path) as temporary:
-        save(header, 1, stored, temporary)
+        save_image(header, 1, stored, temporary)
 
 
 def to_16_bits(array: Array, factor: float) -> tuple[Array, Any]:
@@ -101,7 +101,7 @@ def add_pixels(header: Any, stored: Array, slope: Any, spacing: Floats, code: st
     `code` and `meaning` are UCUM's for the unit of the values; HU are CT numbers.
     """
     is_signed = stored.dtype.kind == "i"
-    tagged(
+    set_tags(
         header, Rows=stored.shape[1], Columns=stored.shape[2], BitsAllocated=16, BitsStored=16, HighBit=15,
         PixelRepresentation=int(is_signed), SamplesPerPixel=1, PhotometricInterpretation="MONOCHROME2",
         PixelSpacing=decimals(spacing[1::-1]), RescaleSlope=slope, RescaleIntercept=0,
@@ -109,8 +109,8 @@ def add_pixels(header: Any, stored: Array, slope: Any, spacing: Floats, code: st
     if code == "HU":
         header.RescaleType = code
         return
-    unit = tagged(None, CodeValue=code, CodingSchemeDesignator="UCUM", CodeMeaning=meaning)
-    values = tagged(
+    unit = set_tags(None, CodeValue=code, CodingSchemeDesignator="UCUM", CodeMeaning=meaning)
+    values = set_tags(
         None, RealWorldValueSlope=float(slope), RealWorldValueIntercept=0.0, MeasurementUnitsCodeSequence=[unit],
         LUTLabel=code, LUTExplanation=meaning,
     )  # fmt: skip
@@ -124,7 +124,7 @@ def _place(position: Floats, axes: Floats) -> dict[str, Any]:
     return {"ImagePositionPatient": decimals(position), "ImageOrientationPatient": decimals(axes[:, :2].T.ravel())}
 
 
-def described(modality: str, template: AnyPath | None, tags: Mapping[str, Any]) -> Any:
+def new_header(modality: str, template: AnyPath | None, tags: Mapping[str, Any]) -> Any:
     """Return a data set with the tags of patient, study and series: empty ones, those of a template, those given."""
     import pydicom
     from pydicom.datadict import dictionary_VR, tag_for_keyword
@@ -132,8 +132,8 @@ def described(modality: str, template: AnyPath | None, tags: Mapping[str, Any]) 
 
     required = f"{_REQUIRED} {_REQUIRED_OF[modality]}".split()
     keywords = {*required, *_OPTIONAL.split()}
-    data = tagged(None, **{keyword: [] if keyword.endswith("Sequence") else None for keyword in required})
-    tagged(data, StudyInstanceUID=generate_uid(), FrameOfReferenceUID=generate_uid())
+    data = set_tags(None, **{keyword: [] if keyword.endswith("Sequence") else None for keyword in required})
+    set_tags(data, StudyInstanceUID=generate_uid(), FrameOfReferenceUID=generate_uid())
     if template is not None:
         with reading(template, "DICOM"):
             source = pydicom.dcmread(require_file(template), stop_before_pixels=True)
@@ -148,13 +148,13 @@ def described(modality: str, template: AnyPath | None, tags: Mapping[str, Any]) 
         except (ValueError, TypeError) as error:
             raise InputError(f"tag {keyword}: {first_line(error).partition(' Please')[0]}") from None
     storage = CTImageStorage if modality == "CT" else NuclearMedicineImageStorage
-    return tagged(
+    return set_tags(
         data, SpecificCharacterSet="ISO_IR 192", SOPClassUID=storage, Modality=modality, Manufacturer="mphDRR",
         SoftwareVersions=VERSION, SeriesInstanceUID=generate_uid(),
     )  # fmt: skip
 
 
-def tags_of(texts: Iterable[str]) -> dict[str, str]:
+def parse_tags(texts: Iterable[str]) -> dict[str, str]:
     """Return the values of tags by keyword, from texts such as ``PatientName=Doe^Jo``; empty texts are left out."""
     pairs = [text.partition("=") for text in texts if text.strip()]
     for keyword, equals, _ in pairs:
@@ -163,17 +163,17 @@ def tags_of(texts: Iterable[str]) -> dict[str, str]:
     return {keyword.strip(): value.strip() for keyword, _, value in pairs}
 
 
-def save(data: Any, number: int, pixels: Array, path: Path) -> None:
+def save_image(data: Any, number: int, pixels: Array, path: Path) -> None:
     """Write a data set with these pixels as instance `number` of its series to a file."""
     from pydicom.dataset import FileMetaDataset
     from pydicom.uid import ExplicitVRLittleEndian, generate_uid
 
-    data.file_meta = tagged(FileMetaDataset(), TransferSyntaxUID=ExplicitVRLittleEndian)
+    data.file_meta = set_tags(FileMetaDataset(), TransferSyntaxUID=ExplicitVRLittleEndian)
     data.add_new("PixelData", "OW", pixels.tobytes())
-    tagged(data, SOPInstanceUID=generate_uid(), InstanceNumber=number).save_as(path, enforce_file_format=True)
+    set_tags(data, SOPInstanceUID=generate_uid(), InstanceNumber=number).save_as(path, enforce_file_format=True)
 
 
-def tagged(data: Any, **tags: Any) -> Any:
+def set_tags(data: Any, **tags: Any) -> Any:
     """Set tags by keyword in a data set, a new one for None, and return it."""
     from pydicom.dataset import Dataset
 

@@ -86,7 +86,8 @@ class Emission(Model):
     pixel_points : int, optional
         Number of points of each pixel's area, for each point of the hole, from which rays start. None: as many as
         `tolerance` requires: small voxels on large pixels take many. A number of your own is used as it is, with a warning
-        if it is too small for the tolerance, and with `intrinsic_fwhm` in each part of a pixel. 1, with one point of the hole: the pixels' centres alone.
+        if it is too small for the tolerance; with `intrinsic_fwhm` each part of a pixel has as many. 1, with one point of
+        the hole: the pixels' centres alone.
     tolerance : float
         Largest relative error of the total counts of a single voxel in any module, wherever it lies between the rays: 2 %
         by default. Larger sources are more accurate.
@@ -418,8 +419,9 @@ class Emission(Model):
         """Return the number of parts of a pixel's side that are blurred apart, as many as the module with most needs."""
         if not np.any(self.intrinsic_fwhm):
             return 1
-        voxel = grid.voxel_volume ** (1 / 3) * self.system.collimator_length / self.system.pinhole_distance
-        widths = np.hypot(voxel, 0.0 if self.hole == "point" else self.effective_diameter)
+        magnification = self.system.collimator_length / self.system.pinhole_distance
+        hole = 0.0 if self.hole == "point" else self.effective_diameter * (1 + magnification)
+        widths = np.hypot(grid.voxel_volume ** (1 / 3) * magnification, hole)
         sigmas = [self._optics_of(m).intrinsic_fwhm / FWHM_PER_SIGMA for m in range(len(views))]
         pixels = [self.crystal_pitch(views, m) for m in range(len(views))]
         blurs = {(s / p, w / p) for s, w, sides in zip(sigmas, widths.tolist(), pixels, strict=True) for p in sides}

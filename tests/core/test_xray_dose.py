@@ -7,7 +7,7 @@ import pytest
 
 import mphdrr.core as mph
 from mphdrr.core.xray.coefficients import energy_absorption
-from mphdrr.core.xray.dose import build_up_factor, convolve, decays, line_kernel, voxel_kernel
+from mphdrr.core.xray.dose import build_up_factor, convolve, line_kernel, voxel_kernel
 
 from .conftest import refused
 
@@ -31,10 +31,20 @@ def test_electrons_of_lutetium_in_water():
     [("Tc-99m", 0.0162, 0.1266), ("I-123", 0.0282, 0.1730), ("I-131", 0.1918, 0.3828), ("Lu-177", 0.1479, 0.0351)],
 )
 def test_decays_set_the_energies_of_icrp_107_free(isotope, electrons, photons):
-    decay = decays()[isotope]
-    assert decay.electrons / 1000 == pytest.approx(electrons, rel=3e-3)
-    total = decay.soft_photons + sum(energy * share for energy, share in decay.lines)
+    nuclide = mph.isotope(isotope)
+    assert nuclide.electrons / 1000 == pytest.approx(electrons, rel=3e-3)
+    total = nuclide.soft_photons + sum(energy * share for energy, share in nuclide.lines + nuclide.weak_lines)
     assert total / 1000 == pytest.approx(photons, rel=3e-3)
+
+
+@pytest.mark.parametrize("name", mph.ISOTOPES)
+def test_every_isotope_has_a_dose(name):
+    """In a large body nearly all energy stays: electrons, soft photons and lines, of 1 kBq in each mm^3 of 1 mg."""
+    nuclide = mph.isotope(name)
+    energy = nuclide.electrons + nuclide.soft_photons
+    energy += sum(energy * photons for energy, photons in nuclide.lines + nuclide.weak_lines)
+    rate = mph.absorbed_dose_rate(uniform(shape=24, spacing=80.0), name).array[12, 12, 12]
+    assert rate == pytest.approx(1000 * energy * 1.602176634e-16 * 1e3 * 3600 * 1e6, rel=0.05)
 
 
 @pytest.mark.parametrize("energy", [30.0, 60.0, 140.5, 208.4, 364.5, 637.0])
@@ -113,7 +123,7 @@ def test_what_has_no_dose_is_refused():
     activity = uniform()
     mu = mph.Volume(activity.array, activity.grid, "mu")
     for call, words in (
-        (lambda: mph.absorbed_dose_rate(activity, "F-18"), "isotope"),
+        (lambda: mph.absorbed_dose_rate(activity, "Co-57"), "isotope"),
         (lambda: mph.absorbed_dose_rate(mu, "Lu-177"), "of activity, got mu"),
         (lambda: mph.absorbed_dose_rate(activity, "Lu-177", density=0), "density: expected more than 0"),
         (lambda: mph.absorbed_dose_rate(activity, "Lu-177", density=np.ones(3)), "density: expected one number or"),

@@ -64,7 +64,7 @@ class MPHDRR_OT_add_dose_map(jobs.JobOperator, bpy.types.Operator):
     """Make a volume of the absorbed dose rate (mGy/h) from the active volume of activity, as in water of density 1."""
 
     isotope: EnumProperty(name="Isotope", description="Isotope that decays",
-                          items=choices.items(choices.ISOTOPES, ((name, name, "") for name in ISOTOPES)),
+                          items=choices.items({}, ((name, name, "") for name in ISOTOPES)),
                           default="Tc-99m")  # fmt: skip
 
     poll = needs((_is_activity, "No activity is active: select a volume of activity"))

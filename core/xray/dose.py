@@ -55,8 +55,9 @@ def absorbed_dose_rate(
         their voxel. For photons the water has a single density, the mass-weighted mean ``sum(density^2) / sum(density)``.
     photons
         "build-up": ``E mu_en / rho B(mu r) exp(-mu r) / (4 pi r^2)`` with the build-up factors of ANSI/ANS-6.4.3 for a
-        point source in water, scaled so that water without end absorbs all of the energy. "straight": ``B = 1`` and mu_en for mu, so that photons lose energy along straight lines;
-        for comparison with closed forms. "none": electrons alone.
+        point source in water, scaled so that water without end absorbs all of the energy.
+        "straight": ``B = 1`` and mu_en for mu, so that photons lose energy along straight lines; for comparison with closed
+        forms. "none": electrons alone.
     progress
         Called while the kernel is computed, which takes most of the time.
 

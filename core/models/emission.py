@@ -456,8 +456,7 @@ class Emission(Model):
     def _ray_weight(self, lengths: Floats, m: int, *, u: Floats, v: Floats) -> Floats:
         """Return the expected counts per mm^2 of crystal, at `lengths` (M,), of module m's rays to (v, u), mm, on it."""
         (opening,) = self.openings(m, 1)
-        # The law depends on u^2 + v^2 alone; in the order v, u the sum has the last digit of earlier versions.
-        return self.pixel_weights(m, v, u, (1.0, 1.0), float(lengths[m]), opening)
+        return self.pixel_weights(m, u, v, (1.0, 1.0), float(lengths[m]), opening)
 
     def caution(self, views: Views, grid: Grid) -> str | None:
         """Return a warning if there are too few rays for the tolerance, or None."""

@@ -90,7 +90,9 @@ class MotionFinder:
         finer = _halve_voxels(reference)
         self._volumes = finer.array, _laplacian(finer.array)
         self._grid = finer.grid
-        self._derivatives_at: dict[int, tuple[Floats, Floats, Floats]] = {}  # by block size: motion, derivatives, smoothed
+        self._derivatives_at: dict[
+            int, tuple[Floats, Floats, Floats]
+        ] = {}  # by block size: motion, derivatives, smoothed
 
     def __call__(self, images: ArrayLike, start: Motion | None = None, iterations: int = 10) -> Motion:
         """Return the motion in `images`, see `find_motion`; `start` is a first guess, such as the motion before."""
@@ -264,7 +266,9 @@ def _halve_voxels(volume: Volume) -> Volume:
     array = np.asarray(volume.array, np.float32)
     for axis in range(3):
         change = np.gradient(array, axis=axis) / 4
-        array = np.stack([array - change, array + change], axis + 1).reshape(*np.multiply(array.shape, 1 + (np.arange(3) == axis)))
+        array = np.stack([array - change, array + change], axis + 1).reshape(
+            *np.multiply(array.shape, 1 + (np.arange(3) == axis))
+        )
     grid = volume.grid
     affine = grid.affine @ affine_matrix(np.eye(3) / 2, np.full(3, -0.25))
     return Volume(array, Grid(array.shape, affine), volume.quantity)

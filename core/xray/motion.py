@@ -72,7 +72,7 @@ class MotionFinder:
     """Finds the motions of a body since a reference from successive sets of images, for motion as it happens.
 
     Images are nearly linear in a motion of less than a voxel, so the derivatives of the set before are kept as long as they
-    are valid. Then a motion takes two or three projections, else about ten. Parameters are those of `find_motion`.
+    are valid. Then a motion takes two or three projections, else 14 more for each block size. Parameters are those of `find_motion`.
     """
 
     def __init__(
@@ -90,9 +90,7 @@ class MotionFinder:
         finer = _halve_voxels(reference)
         self._volumes = finer.array, _laplacian(finer.array)
         self._grid = finer.grid
-        self._derivatives_at: dict[
-            int, tuple[Floats, Floats, Floats]
-        ] = {}  # by block size: motion, derivatives, smoothed
+        self._derivatives_at: dict[int, tuple[Floats, Floats, Floats]] = {}  # by block size; they begin with the motion
 
     def __call__(self, images: ArrayLike, start: Motion | None = None, iterations: int = 10) -> Motion:
         """Return the motion in `images`, see `find_motion`; `start` is a first guess, such as the motion before."""

@@ -72,7 +72,8 @@ class MotionFinder:
     """Finds the motions of a body since a reference from successive sets of images, for motion as it happens.
 
     Images are nearly linear in a motion of less than a voxel, so the derivatives of the set before are kept as long as they
-    are valid. Then a motion takes two or three projections, else 14 more for each block size. Parameters are those of `find_motion`.
+    are valid. Then a motion takes two or three projections, else 14 more for each block size. Parameters are those of
+    `find_motion`.
     """
 
     def __init__(

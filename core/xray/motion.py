@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from ..arrays import ArrayLike, Floats
+from ..arrays import ArrayLike, Floats, Floats32
 from ..errors import InputError, warn
 from ..geometry.frames import affine_matrix, rotations
 from ..geometry.grid import Grid
@@ -157,7 +157,7 @@ class MotionFinder:
             raise InputError(f"photons: expected more than 0, one number or images of {images.shape}")
         return np.broadcast_to(self._photons, images.shape)
 
-    def _project(self, motion: Floats, level: int, array: Floats | None = None) -> Floats:
+    def _project(self, motion: Floats, level: int, array: Floats32 | None = None) -> Floats:
         """Return images (M, n_v, n_u) of the moved reference, or another array, with pixels `level` times as large."""
         grid = _moved_grid(self._grid, _pose(motion, self._center))
         A = Projector(grid, _coarse_views(self.views, level), backend=self._backend)
@@ -268,11 +268,11 @@ def _halve_voxels(volume: Volume) -> Volume:
         array = np.stack([array - change, array + change], axis + 1).reshape(
             *np.multiply(array.shape, 1 + (np.arange(3) == axis))
         )
-    grid = volume.grid
-    affine = grid.affine @ affine_matrix(np.eye(3) / 2, np.full(3, -0.25))
-    return Volume(array, Grid(array.shape, affine), volume.quantity)
+    n_x, n_y, n_z = volume.grid.shape
+    affine = volume.grid.affine @ affine_matrix(np.eye(3) / 2, np.full(3, -0.25))
+    return Volume(array, Grid((2 * n_x, 2 * n_y, 2 * n_z), affine), volume.quantity)
 
 
-def _laplacian(array: Floats) -> Floats:
+def _laplacian(array: Floats32) -> Floats32:
     """Return the sum of the second differences along the axes."""
     return sum(np.gradient(np.gradient(array, axis=axis), axis=axis) for axis in range(3))

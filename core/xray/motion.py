@@ -5,26 +5,28 @@ from typing import Any
 
 import numpy as np
 
-from ..arrays import ArrayLike, Floats
+from ..arrays import ArrayLike, Floats, Floats32
 from ..errors import InputError, warn
 from ..geometry.frames import affine_matrix, rotations
 from ..geometry.grid import Grid
 from ..geometry.views import Views
+from ..physics.crystal import gaussian_blur
 from ..projector import Projector
 from ..reconstruction.least_squares import sirt
 from ..validation import freeze, instance, real_array, whole_number
 from ..volumes.volume import LINE_INTEGRALS, Volume, require_quantity
 
-_LEVELS = ((4, 4), (2, 2), (2, 1))
-"""Pairs of block sizes, pixels: at which images are compared, and at which they are projected.
-
-Coarse blocks come first, to find motion that is larger than details. The last pair reuses the derivatives of the one
-before, since derivatives take many projections.
-"""
+_LEVELS = (4, 2, 1)
+"""Block sizes, pixels, by which images are compared: coarse ones come first, to find motion that is larger than details."""
 _MAX_DISTANCE = 1.0
 """Distance in voxels from the motion at which derivatives were computed, beyond which they are computed anew."""
-_SETTLED, _FINE = 0.1, 0.02
-"""Largest final step, as a share of the standard deviations, or of a voxel."""
+_SMOOTHING = 2.0
+"""Standard deviation, pixels, of the Gaussian that smooths the derivatives by which residuals are weighted.
+
+Details that voxels cannot hold then say little of the motion.
+"""
+_SETTLED, _COARSE, _EXACT = 0.1, 0.02, 1e-4
+"""Largest final step: as a share of the standard deviations; in voxels and pixels of a block; in voxels, without blocks."""
 _MIN_VARIANCE = 1e-12
 """Variance of line integrals by rounding, the least that is assumed."""
 _MAX_CONDITION = 1e12
@@ -44,8 +46,8 @@ class Motion:
     center : array (3,)
         Centre of the reference before the motion, world mm.
     covariance : array (6, 6)
-        Covariance of shift and rotation, mm and rad, by noise, enlarged where the residuals exceed noise. The standard
-        deviations of the rotation are up to a third too small.
+        Covariance of shift and rotation, mm and rad, by the images' noise, enlarged where the residuals exceed noise. It
+        does not contain errors of the reference.
     settled : bool
         Whether the last step was small, so that the iterations converged.
     """
@@ -70,7 +72,8 @@ class MotionFinder:
     """Finds the motions of a body since a reference from successive sets of images, for motion as it happens.
 
     Images are nearly linear in a motion of less than a voxel, so the derivatives of the set before are kept as long as they
-    are valid. Then a motion takes two or three projections, else about ten. Parameters are those of `find_motion`.
+    are valid. Then a motion takes two or three projections, else 14 more for each block size. Parameters are those of
+    `find_motion`.
     """
 
     def __init__(
@@ -85,60 +88,80 @@ class MotionFinder:
         step = reference.grid.spacing.min()
         radius = np.linalg.norm(reference.grid.corners()[0] - self._center) / 2
         self._steps = np.array([step] * 3 + [step / radius] * 3)  # mm and rad that move the body by about a voxel
-        self._derivatives_at: dict[int, tuple[Floats, Floats]] = {}  # by block size: motion, and derivatives at it
+        finer = _halve_voxels(reference)
+        self._volumes = finer.array, _laplacian(finer.array)
+        self._grid = finer.grid
+        self._derivatives_at: dict[int, tuple[Floats, Floats, Floats]] = {}  # by block size; they begin with the motion
 
     def __call__(self, images: ArrayLike, start: Motion | None = None, iterations: int = 10) -> Motion:
         """Return the motion in `images`, see `find_motion`; `start` is a first guess, such as the motion before."""
         measured = real_array(images, "images", (len(self.views), *self.views.shape))
-        noise = self._noise(measured)
+        photons = self._checked_photons(measured)
         motion = np.zeros(6) if start is None else np.concatenate([start.shift, start.rotation])
-        levels = [pair for pair in _LEVELS if all(n % pair[0] == 0 for n in self.views.shape)] or [(1, 1)]
-        for level, fine in levels if start is None else levels[-1:]:
-            blocks, variances = _block_means(measured, level), _block_means(noise, level).ravel() / level**2
+        levels = [level for level in _LEVELS if all(n % level == 0 for n in self.views.shape)]
+        for level in levels if start is None else levels[-1:]:
+            blocks, unexplained = _block_means(measured, level), 0.0
             for _ in range(whole_number(iterations, "iterations")):
-                derivatives = self._derivatives(motion, level)
-                residual = (blocks - _block_means(self._project(motion, fine), level // fine)).ravel()
-                unexplained = max(0.0, float(np.mean(residual**2 - variances)))
-                weights = 1 / np.maximum(variances + unexplained, _MIN_VARIANCE)
-                information = (derivatives * weights) @ derivatives.T
-                if not np.linalg.cond(information) < _MAX_CONDITION:
-                    reason = "these images do not show all of a motion"
-                    raise InputError(f"find_motion: {reason}: expected more or other views")
-                inverse = np.linalg.inv(information)
-                step = inverse @ (derivatives @ (weights * residual))
-                motion = motion + self._steps * step
-                variance = float(weights @ residual**2) / max(1, residual.size - 6)
-                limits = np.maximum(_SETTLED * np.sqrt(variance * np.diag(inverse)), _FINE * level)
-                settled = bool(np.all(np.abs(step) <= limits))
+                derivatives, smoothed = self._derivatives(motion, level)
+                expected = self._project(motion, level)
+                if photons is None:
+                    residual, variances = (blocks - expected).ravel(), np.zeros(blocks.size)
+                else:  # of transmitted photons, whose noise has no mean and a variance that does not depend on it
+                    residual = -np.expm1(expected - blocks).ravel()
+                    variances = (np.exp(expected) / _block_means(photons, level)).ravel() / level**2
+                for _ in range(2):  # the second with weights by what the first leaves unexplained
+                    weights = 1 / np.maximum(variances + unexplained, _MIN_VARIANCE)
+                    rows = smoothed * weights
+                    information = rows @ derivatives.T
+                    if not np.linalg.cond(information) < _MAX_CONDITION:
+                        reason = "these images do not show all of a motion"
+                        raise InputError(f"find_motion: {reason}: expected more or other views")
+                    inverse = np.linalg.inv(information)
+                    step = inverse @ (rows @ residual)
+                    rest = residual - step @ derivatives
+                    unexplained = max(0.0, float(np.mean(rest**2 - variances)))
+                motion = motion + self._steps * step[:6]
+                variance = float(weights @ rest**2) / max(1, rest.size - len(step))
+                covariance = variance * (inverse @ (rows @ smoothed.T) @ inverse.T)[:6, :6]
+                least = _COARSE * level if level > 1 else _EXACT
+                settled = bool(np.all(np.abs(step[:6]) <= np.maximum(_SETTLED * np.sqrt(np.diag(covariance)), least)))
                 if settled:
                     break
         if not settled:
             warn("find_motion: it has not settled: the motion may be too large, or the body changed", 2)
-        covariance = variance * inverse * np.outer(self._steps, self._steps)
+        covariance = covariance * np.outer(self._steps, self._steps)
         return Motion(freeze(motion[:3]), freeze(motion[3:]), self._center, freeze(covariance), settled)
 
-    def _derivatives(self, motion: Floats, level: int) -> Floats:
-        """Return the derivatives (6, pixels) of the images by the six numbers, in units of `_steps`, at or near a motion."""
-        computed_at, derivatives = self._derivatives_at.get(level, (np.full(6, np.inf), np.zeros((6, 0))))
+    def _derivatives(self, motion: Floats, level: int) -> tuple[Floats, Floats]:
+        """Return the derivatives (8, pixels) of the images, and smoothed ones, at or near a motion.
+
+        Six are by the motion, in units of `_steps`. Two are by the reference's blur and by the variation of transmission
+        within a pixel, which are fitted besides, since at sharp edges they are like motion.
+        """
+        computed_at, *derivatives = self._derivatives_at.get(level, (np.full(6, np.inf),) * 3)
         if np.abs((motion - computed_at) / self._steps).max() > _MAX_DISTANCE:
             ends = [[self._project(motion + sign * step, level) for sign in (1, -1)] for step in np.diag(self._steps)]
-            derivatives = np.stack([(upper - lower).ravel() / 2 for upper, lower in ends])
-            self._derivatives_at[level] = motion, derivatives
-        return derivatives
+            slopes = np.gradient(self._project(motion, level), axis=(1, 2))
+            images = [(upper - lower) / 2 for upper, lower in ends]
+            images += [self._project(motion, level, self._volumes[1]), slopes[0] ** 2 + slopes[1] ** 2]
+            along_v, along_u = (gaussian_blur(n, _SMOOTHING) for n in images[0].shape[1:])
+            derivatives = [np.reshape(array, (len(images), -1)) for array in (images, along_v @ images @ along_u.T)]
+            self._derivatives_at[level] = motion, *derivatives
+        return derivatives[0], derivatives[1]
 
-    def _noise(self, images: Floats) -> Floats:
-        """Return the variances of line integrals by the number of transmitted photons; 0 if it is unknown."""
+    def _checked_photons(self, images: Floats) -> Floats | None:
+        """Return the number of photons of each pixel without a body, None if it is unknown."""
         if self._photons is None:
-            return np.zeros(images.shape)
+            return None
         if self._photons.shape not in ((), images.shape) or self._photons.min() <= 0:
             raise InputError(f"photons: expected more than 0, one number or images of {images.shape}")
-        return np.exp(images) / self._photons
+        return np.broadcast_to(self._photons, images.shape)
 
-    def _project(self, motion: Floats, level: int) -> Floats:
-        """Return images (M, n_v, n_u) of the moved reference, with pixels `level` times as large."""
-        grid = _moved_grid(self.reference.grid, _pose(motion, self._center))
+    def _project(self, motion: Floats, level: int, array: Floats32 | None = None) -> Floats:
+        """Return images (M, n_v, n_u) of the moved reference, or another array, with pixels `level` times as large."""
+        grid = _moved_grid(self._grid, _pose(motion, self._center))
         A = Projector(grid, _coarse_views(self.views, level), backend=self._backend)
-        return np.asarray(A(self.reference.array), float)
+        return np.asarray(A(self._volumes[0] if array is None else array), float)
 
 
 def find_motion(
@@ -232,3 +255,24 @@ def _block_means(images: Floats, level: int) -> Floats:
     """Return the means of images (..., n_v, n_u) over square blocks of `level` pixels."""
     *first, n_v, n_u = images.shape
     return images.reshape(*first, n_v // level, level, n_u // level, level).mean(axis=(-3, -1))
+
+
+def _halve_voxels(volume: Volume) -> Volume:
+    """Return a volume with voxels half as large, whose values vary linearly in a voxel and have its mean.
+
+    Its images change less abruptly with motion than those of uniform voxels.
+    """
+    array = np.asarray(volume.array, np.float32)
+    for axis in range(3):
+        change = np.gradient(array, axis=axis) / 4 if array.shape[axis] > 1 else 0 * array
+        array = np.stack([array - change, array + change], axis + 1).reshape(
+            *np.multiply(array.shape, 1 + (np.arange(3) == axis))
+        )
+    n_x, n_y, n_z = volume.grid.shape
+    affine = volume.grid.affine @ affine_matrix(np.eye(3) / 2, np.full(3, -0.25))
+    return Volume(array, Grid((2 * n_x, 2 * n_y, 2 * n_z), affine), volume.quantity)
+
+
+def _laplacian(array: Floats32) -> Floats32:
+    """Return the sum of the second differences along the axes."""
+    return sum(np.gradient(np.gradient(array, axis=axis), axis=axis) for axis in range(3))

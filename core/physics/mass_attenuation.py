@@ -11,17 +11,14 @@ LOWEST_ENERGY, HIGHEST_ENERGY = 1.0, 1000.0
 Point = tuple[float, float]
 """Energy, keV, and the coefficient at this energy, cm^2/g."""
 
-AIR_ABSORPTION = "air-absorption"
-"""Name, among the elements' symbols, of the mass energy-absorption coefficient of dry air."""
-
 
 @cache
 def mass_attenuation(symbol: str, energy: float) -> float:
     """Return the mass attenuation coefficient, cm^2/g, of the element with this symbol at an energy, keV.
 
-    It is interpolated by a cubic in the logarithms through the four nearest energies of the table that no absorption edge
-    separates from `energy`; by a power law where they rise above an edge with one energy up to the next, as above M edges.
-    At an edge it is the coefficient above the edge.
+    The symbol "air-absorption" stands for the mass energy-absorption coefficient of air. Coefficients are interpolated by a
+    cubic in the logarithms through the four nearest energies of the table that no absorption edge separates from `energy`;
+    where they rise above an edge, with one energy up to the next edge, by a power law. At an edge it is the one above it.
     """
     points, edges = table()[symbol]
     first = [(edge, above) for edge, _, above in edges if edge <= energy][-1:]

@@ -7,7 +7,7 @@ import numpy as np
 
 from ..arrays import Floats
 from ..errors import InputError
-from ..physics.mass_attenuation import AIR_ABSORPTION, mass_attenuation
+from ..physics.mass_attenuation import mass_attenuation
 from ..physics.materials import MATERIALS, attenuation
 from ..validation import freeze
 
@@ -32,7 +32,7 @@ def _attenuations(material: str, energies: tuple[float, ...]) -> Floats:
 def energy_absorption(material: str, energies: Floats) -> Floats:
     """Return mass energy-absorption coefficients (n,), cm^2/g, of "air" at 1, of "water" at 10 to 1000 keV."""
     if material == "air":
-        return np.array([mass_attenuation(AIR_ABSORPTION, energy) for energy in energies.tolist()])
+        return np.array([mass_attenuation("air-absorption", energy) for energy in energies.tolist()])
     return interpolate_log(energies, *photon_data()[:2])
 
 

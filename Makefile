@@ -104,8 +104,8 @@ test-gate: env-gate
 
 test-peers: env-peers
 	@# a missing one would only be skipped; deepinv needs a word before it is imported, which its tests say
-	@$(BIN)/python -c "import astra, cv2, itk, kornia, lib3mf, pytomography.algorithms, pytorch3dunet.datasets.hdf5, scipy, webdataset; from importlib.metadata import version; version('deepinv')"
-	$(BIN)/python -m pytest tests/core/test_geometry_export_peers.py tests/core/test_adapters.py tests/core/test_event_exports_peers.py
+	@$(BIN)/python -c "import astra, cv2, itk, kornia, lib3mf, pytomography.algorithms, pytorch3dunet.datasets.hdf5, scipy, spekpy, webdataset; from importlib.metadata import version; version('deepinv')"
+	$(BIN)/python -m pytest tests/core/test_geometry_export_peers.py tests/core/test_adapters.py tests/core/test_event_exports_peers.py tests/core/test_xray_spectra.py
 
 env:
 	$(ENVIRONMENT) --extras blender

@@ -1,6 +1,6 @@
 """Make core/xray/tube_spectra.txt with SpekPy: `pip install spekpy`, then `python tools/tube_spectra.py`.
 
-SpekPy is no dependency of the package: 164 MB for a table of 60 kB.
+SpekPy is no dependency of the package: 164 MB for a table of 75 kB.
 """
 
 from importlib.metadata import version
@@ -9,7 +9,8 @@ from pathlib import Path
 import spekpy
 
 TABLE = Path(__file__).resolve().parents[1] / "core" / "xray" / "tube_spectra.txt"
-ANGLE, STEP, LOWEST = 12, 0.5, 10.0
+ANGLE, STEP, LOWEST = 12, 0.5, 1.0
+VOLTAGES = [*range(20, 40), *range(40, 151, 2)]  # linear interpolation between them is worst where the voltage is low
 
 HEAD = f"""\
 # Spectra of tungsten tubes with an anode of {ANGLE} degrees, before any filter but the anode itself: on the central axis at
@@ -30,4 +31,4 @@ def line(kvp: int) -> str:
 
 
 if __name__ == "__main__":
-    TABLE.write_text(HEAD + "".join(line(kvp) + "\n" for kvp in range(40, 151, 2)), encoding="ascii")
+    TABLE.write_text(HEAD + "".join(line(kvp) + "\n" for kvp in VOLTAGES), encoding="ascii")

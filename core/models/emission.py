@@ -93,7 +93,7 @@ class Emission(Model):
         by default. Larger sources are more accurate.
     hole : str
         ``"depth"``: the depth-dependent pinhole response, the blur of the whole hole without rays. Every voxel's image is
-        right to 1 % and its total to 0.1 %; with `depth_layers` to 2 % and 0.5 %. It takes no grid that comes close to a
+        right to 1 % and its total to 0.1 %; with `depth_layers` to 2 % and 0.35 %. It takes no grid that comes close to a
         pinhole, and no backend cuda. ``"rays"``: lines through `aperture_points`. ``"point"``: lines through the hole's
         centre, an ideal pinhole without blur. ``"auto"``: the depth-dependent response, and rays for voxels close to a
         pinhole; rays alone where the response is not available, or where a number of rays is given.

@@ -42,7 +42,7 @@ def hu_to_mu(volume: Volume, energy: float = 140.5, ct_energy: float = CT_ENERGY
     `InputWarning` is given for values below -1024 or above 3071 HU, if all values lie within 5 HU of water, and if no value
     is below -500 HU, as where the numbers are CT numbers + 1024, or grey values.
 
-    `energy` is the photons' energy, keV, 10 to 1000: 140.5 for Tc-99m, 71 and 80 for Tl-201, 159 for I-123, 511 for F-18.
+    `energy` is the photons' energy, keV, 1 to 1000: 140.5 for Tc-99m, 71 and 80 for Tl-201, 159 for I-123, 511 for F-18.
     `ct_energy` is the effective energy of the CT, keV.
     """
     instance(volume, Volume, "hu_to_mu")

@@ -1,11 +1,11 @@
-"""Mass attenuation coefficients of the elements, 10 to 1000 keV, from NIST's table in mass_attenuation.txt."""
+"""Mass attenuation coefficients of the elements, 1 to 1000 keV, from NIST's table in mass_attenuation.txt."""
 
 from functools import cache
 from pathlib import Path
 
 import numpy as np
 
-LOWEST_ENERGY, HIGHEST_ENERGY = 10.0, 1000.0
+LOWEST_ENERGY, HIGHEST_ENERGY = 1.0, 1000.0
 """Range of the table's energies, keV."""
 
 Point = tuple[float, float]
@@ -16,16 +16,17 @@ Point = tuple[float, float]
 def mass_attenuation(symbol: str, energy: float) -> float:
     """Return the mass attenuation coefficient, cm^2/g, of the element with this symbol at an energy, keV.
 
-    It is interpolated by a cubic in the logarithms through the four nearest energies of the table that no absorption edge
-    separates from `energy`. At an edge it is the coefficient above the edge.
+    The symbol "air-absorption" stands for the mass energy-absorption coefficient of air. Coefficients are interpolated by a
+    cubic in the logarithms through the four nearest energies of the table that no absorption edge separates from `energy`;
+    where they rise above an edge, with one energy up to the next edge, by a power law. At an edge it is the one above it.
     """
     points, edges = table()[symbol]
     first = [(edge, above) for edge, _, above in edges if edge <= energy][-1:]
     last = [(edge, below) for edge, below, _ in edges if edge > energy][:1]
     low, high = first[0][0] if first else 0.0, last[0][0] if last else np.inf
     energies, values = np.array([*first, *(point for point in points if low < point[0] < high), *last]).T
-    count = min(4, len(energies))
-    start = np.clip(np.searchsorted(energies, energy) - 2, 0, len(energies) - count)
+    count = min(4, len(energies)) if len(energies) != 3 or values[1] < values[0] else 2
+    start = np.clip(np.searchsorted(energies, energy) - count // 2, 0, len(energies) - count)
     nearest = slice(start, start + count)
     curve = np.polyfit(np.log(energies[nearest] / energy), np.log(values[nearest]), count - 1)
     return float(np.exp(curve[-1]))  # the cubic's value at log(1)

@@ -49,8 +49,8 @@ def attenuation(material: str, energy: float) -> float:
     """Return the linear attenuation coefficient, 1/mm, of a material at a photon energy.
 
     The material is one of `MATERIALS`, in upper or lower case; at another density, the coefficient is proportional to it.
-    The energy is from 10 to 1000 keV. The result agrees with Elam et al. (2002) within 0.3 % from 30 keV on and within 0.5 %
-    below.
+    The energy is from 1 to 1000 keV. The result agrees with Elam et al. (2002) within 0.3 % from 30 keV on and within 0.5 %
+    from 10 keV on.
     """
     mixture = _find_material(material)
     energy = positive(energy, "energy", "keV")

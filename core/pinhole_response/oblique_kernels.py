@@ -27,6 +27,8 @@ _STEEPEST = 0.98
 # Taps below this fraction of those inside the shadow are left out: tails are wide. Rows and columns at the rim in which no
 # tap exceeds the second fraction, of the largest tap, are left out, too: they are ripples of the transform.
 _SMALLEST_TAP, _STRAY_TAP = 3e-3, 3e-4
+# Frequency, per cell, from which on the spline's blur is undone no further: fine cells do not have it.
+_HIGHEST_FREQUENCY = 0.6
 
 
 class ObliqueKernel(NamedTuple):
@@ -105,6 +107,31 @@ def oblique_kernel(zone: DepthZone, effects: DirectionalEffects, position: Array
     ellipse_forms = np.stack([forms[:, 0, 0], forms[:, 1, 1], 2 * forms[:, 0, 1]], -1)
     ellipses = ellipse_forms, np.outer(off_center, axis) / cell_size, ellipse_weights
     return ObliqueKernel(*ellipses, depth_shifts, hole_scales, depth_weights, mixing_variance)
+
+
+def balance_factors(zone: DepthZone, v: Array, u: Array) -> Array | float:
+    """Return factors of cells at crystal positions v (n, 1) and u (m,), mm, that keep the totals of interaction depths.
+
+    Photons of a depth are shifted by s times the position of the node, or pixel, that they are mixed for. So seen from the
+    cells, nodes are 1 + s times as far apart as the linear shares with which they are mixed assume, and the shares sum to 1
+    on average alone. The ripples about it are a Fourier series: of the shares' transform, times that of the point's image.
+    """
+    if zone.effects is None or not zone.effects.crystal_mu:
+        return 1.0
+    node, shape, spacing = oblique_kernel(zone, zone.effects, np.zeros(2)), zone.kernel_shape, zone.node_spacing
+    stretch, scale = 1 + node.hole_scales, shape.image_scales.mean()
+    photons = node.depth_weights / stretch**2
+    numbers, orders, ripples = zone.numbers, np.arange(1.0, 1.5 * spacing + 1)[:, None], []
+    for i, x in enumerate((v[:, 0], u)):
+        per_pixel = orders / (spacing * stretch)
+        per_cell = per_pixel / zone.cells_per_pixel[i]
+        hole, _ = disc_transform((stretch + scale) * shape.hole_diameter[i] * per_cell)
+        voxel = np.prod(np.sinc(scale * shape.voxel_edges[i] * per_cell[..., None]), axis=-1)
+        image = hole * voxel / np.sinc(per_cell.clip(max=_HIGHEST_FREQUENCY)) ** 3
+        amplitudes = photons / photons.sum() * image * np.sinc(spacing * per_pixel) ** 2 / np.sinc(per_pixel)
+        places = (x / stretch[:, None] - numbers.first[i]) / (numbers.pitch[i] * spacing)
+        ripples.append(2 * np.einsum("nk,nkx->x", amplitudes, np.cos(2 * np.pi * orders[..., None] * places)))
+    return np.asarray(1 - ripples[0][:, None] - ripples[1])
 
 
 def _edge_layers(knife: KnifeEdge, slope: float, n: int) -> tuple[Array, Array]:

@@ -10,7 +10,7 @@ from ..arrays import Array
 from .depth_response import Block, DepthResponse, Index
 from .depth_zone import DepthZone, ViewNumbers
 from .directional_effects import DirectionalEffects
-from .oblique_kernels import NodeKernelGradient
+from .oblique_kernels import NodeKernelGradient, balance_factors
 from .pixel_kernels import KernelShape, pixel_kernels_gradient
 from .zone_response import correction_numbers, half_widths, second_order_correction, zone_kernels
 
@@ -80,9 +80,9 @@ def zone_gradient(
     gradient
         Gradient of a loss by that response.
     """
-    kernels, d_shape, d_correction, d_nodes = _tap_chain(zone, response, gradient.kernels)
-    half, first_pixels = half_widths(kernels), [part.start or 0 for part in pixels]
+    first_pixels, half = [part.start or 0 for part in pixels], half_widths(response.kernels)
     first_cells = [zone.cells_per_pixel[i] * first_pixels[i] - half[i] for i in range(2)]
+    d_shape, d_correction, d_nodes = _tap_chain(zone, response, first_cells, gradient)
     total, d_cell_size = _matrix_chain(zone, response, origin, first_cells, gradient)
     d_numbers, d_mean_correction, d_size = _cell_chain(zone, first_cells, gradient.cell_weights)
     total, d_cell_size = total.plus(d_numbers), d_cell_size + d_size
@@ -95,12 +95,15 @@ def zone_gradient(
     return total.plus(d_numbers)._replace(pitch=pitch)
 
 
-def _tap_chain(zone: DepthZone, response: DepthResponse, d_box: Array) -> tuple[Array, KernelShape, Array, ViewNumbers]:
-    """Return the kernels and what their gradient becomes: the gradients by shape, by correction, and by the view's numbers.
+def _tap_chain(
+    zone: DepthZone, response: DepthResponse, first_cells: list[int], gradient: ResponseGradient
+) -> tuple[KernelShape, Array, ViewNumbers]:
+    """Return what the gradient by the kernels becomes: the gradients by shape, by correction, and by the view's numbers.
 
-    The kernels are without the second-order correction, and the gradient by the correction (planes,) is that of
-    ``correction - correction.mean()``. With nodes the gradient by the shape is 0, and all flows to the view's numbers.
+    The gradient by the correction (planes,) is that of ``correction - correction.mean()``. With nodes the gradient by the
+    shape is 0, and all flows to the view's numbers, as does the gradient through the cells' `balance_factors`.
     """
+    d_box = gradient.kernels
     first = round((response.first_plane - zone.inverse_depths[0]) * response.planes_per_inverse_depth)
     d_kernels = np.zeros((len(zone.inverse_depths), *d_box.shape[1:]))
     d_kernels[first : first + len(d_box)] = d_box
@@ -108,14 +111,17 @@ def _tap_chain(zone: DepthZone, response: DepthResponse, d_box: Array) -> tuple[
     factors = (1 + correction - correction.mean()).reshape(-1, *[1] * (d_kernels.ndim - 1))
     if zone.effects is None:
         kernels, d_shape = pixel_kernels_gradient(zone.kernel_shape, zone.cells_per_pixel, d_kernels * factors)
-        return kernels, d_shape, (d_kernels * kernels).sum(axis=(1, 2)), ViewNumbers.zero()
+        return d_shape, (d_kernels * kernels).sum(axis=(1, 2)), ViewNumbers.zero()
     kernels, zero_shape = zone_kernels(zone), KernelShape(*(0 * number for number in zone.kernel_shape))
     d_correction = (d_kernels * kernels).sum(axis=(1, 2, 3, 4))
-    return kernels, zero_shape, d_correction, _node_tap_chain(zone, zone.effects, d_kernels * factors)
+    d_nodes = _node_chain(zone, zone.effects, d_kernels * factors, first_cells, gradient.cell_weights)
+    return zero_shape, d_correction, d_nodes
 
 
-def _node_tap_chain(zone: DepthZone, effects: DirectionalEffects, d_kernels: Array) -> ViewNumbers:
-    """Return the gradient by the view's numbers that flows through the nodes' kernels, by central differences."""
+def _node_chain(
+    zone: DepthZone, effects: DirectionalEffects, d_kernels: Array, first_cells: list[int], d_log_weights: Array
+) -> ViewNumbers:
+    """Return the gradient by the view's numbers through kernels of nodes and factors of cells, by central differences."""
     numbers, form = zone.numbers, NodeKernelGradient(zone, effects, d_kernels)
 
     def difference(name: str, index: Index, scale: float) -> float:
@@ -125,10 +131,12 @@ def _node_tap_chain(zone: DepthZone, effects: DirectionalEffects, d_kernels: Arr
             step = np.zeros_like(getattr(numbers, name))
             step[index] = sign * _STEP * scale
             moved = replace(zone, numbers=numbers.plus(ViewNumbers.zero()._replace(**{name: step})))
+            places = moved.crystal_positions(first_cells, d_log_weights.shape, moved.cell_size)
+            balance = float((d_log_weights * np.log(balance_factors(moved, *places))).sum())
             if name == "to_camera":  # the kernels depend on it by the edges alone
-                values.append(form.value_by_edges(moved))
+                values.append(balance + form.value_by_edges(moved))
             else:
-                values.append(form.value(moved, effects.with_effective_diameter(moved.numbers.diameter)))
+                values.append(balance + form.value(moved, effects.with_effective_diameter(moved.numbers.diameter)))
         return (values[0] - values[1]) / (2 * _STEP * scale)
 
     longest_edge, result = float(np.abs(numbers.to_camera[:, :3]).max()), ViewNumbers.zero()

@@ -5,7 +5,7 @@ import numpy as np
 from ..arrays import Array
 from .depth_response import DepthResponse
 from .depth_zone import DepthZone
-from .oblique_kernels import node_kernels
+from .oblique_kernels import balance_factors, node_kernels
 from .pixel_kernels import Pair, pixel_kernels
 
 
@@ -25,7 +25,7 @@ def zone_response(zone: DepthZone, dtype: type) -> DepthResponse:
     squared_secant = 1 + (v**2 + u**2) / numbers.length**2
     piece_volume, voxel_exponent = zone.voxel_volume / zone.pieces_per_edge.prod(), 1 - zone.pixel_exponent
     cell_weights = piece_volume * numbers.length**2 * zone.point_weight(u=u, v=v) ** voxel_exponent
-    cell_weights *= 1 + correction.mean() / squared_secant**2
+    cell_weights *= (1 + correction.mean() / squared_secant**2) * balance_factors(zone, v, u)
     v, u = zone.crystal_positions([0, 0], zone.image_shape, numbers.pitch)
     pixel_weights = zone.point_weight(u=u, v=v) ** zone.pixel_exponent * np.outer(*zone.fractions_on_crystal())
     depths = zone.piece_edges[2]

@@ -1,4 +1,4 @@
-"""Photon coefficients of materials at many energies, and the tables of air and water in photon_data.txt."""
+"""Photon coefficients of materials at many energies, and the table of water in photon_data.txt."""
 
 from functools import cache
 from pathlib import Path
@@ -7,6 +7,7 @@ import numpy as np
 
 from ..arrays import Floats
 from ..errors import InputError
+from ..physics.mass_attenuation import mass_attenuation
 from ..physics.materials import MATERIALS, attenuation
 from ..validation import freeze
 
@@ -29,14 +30,15 @@ def _attenuations(material: str, energies: tuple[float, ...]) -> Floats:
 
 
 def energy_absorption(material: str, energies: Floats) -> Floats:
-    """Return mass energy-absorption coefficients (n,), cm^2/g, of "air" or "water" at 10 to 1000 keV."""
-    table = photon_data()
-    return interpolate_log(energies, table[0], table[1 if material == "air" else 2])
+    """Return mass energy-absorption coefficients (n,), cm^2/g, of "air" at 1, of "water" at 10 to 1000 keV."""
+    if material == "air":
+        return np.array([mass_attenuation("air-absorption", energy) for energy in energies.tolist()])
+    return interpolate_log(energies, *photon_data()[:2])
 
 
 @cache
 def photon_data() -> Floats:
-    """Return the columns (9, n) of photon_data.txt."""
+    """Return the columns (8, n) of photon_data.txt."""
     return table_numbers("photon_data.txt").T
 
 

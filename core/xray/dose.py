@@ -135,7 +135,7 @@ def line_kernel(lines: tuple[tuple[float, float], ...], density: float, r: Float
     total = np.zeros(r.shape)
     energies = np.array([energy for energy, _ in lines])
     absorption = energy_absorption("water", energies) / 10  # mm^2/mg
-    attenuation = interpolate_log(energies, *photon_data()[[0, 3]]) / 10 if build_up else absorption
+    attenuation = interpolate_log(energies, *photon_data()[[0, 2]]) / 10 if build_up else absorption
     for (energy, photons), absorbed, mu in zip(lines, absorption, density * attenuation, strict=True):
         factor = _absorption_build_up(energy, mu * r, density * absorbed / mu) if build_up else 1.0
         total += photons * energy * absorbed * factor * np.exp(-mu * r)
@@ -156,7 +156,7 @@ def _absorption_build_up(energy: float, depths: Floats, absorbed_share: float) -
 def build_up_factor(energy: float, depths: Floats) -> Floats:
     """Return water's build-up factors at depths of up to 40 mean free paths: ANSI/ANS-6.4.3, geometric progression."""
     table = photon_data()
-    b, c, a, X, d = (np.interp(math.log(energy), np.log(table[0]), row) for row in table[4:])
+    b, c, a, X, d = (np.interp(math.log(energy), np.log(table[0]), row) for row in table[3:])
     x = np.clip(depths, 1e-9, 40.0)
     k = c * x**a + d * (np.tanh(x / X - 2) - math.tanh(-2)) / (1 - math.tanh(-2))
     near_1 = np.abs(k - 1) < 1e-6

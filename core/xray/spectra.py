@@ -12,7 +12,8 @@ from ..errors import InputError, naming, needing
 from ..validation import at_least_0, freeze, positive, real_array
 from .coefficients import attenuations, energy_absorption, table_numbers
 
-_ANGLE, _LOWEST, _STEP = 12.0, 10.0, 0.5  # the table's anode angle, degrees; least energy and step, keV
+_ANGLE, _LOWEST, _STEP = 12.0, 1.0, 0.5  # the table's anode angle, degrees; least energy and step, keV
+_SOFT, _NEGLIGIBLE = 10.0, 1e-6  # energy, keV, below which photons of less than this fraction of the kerma are left out
 _FILTERS: Mapping[str, float] = MappingProxyType({"Al": 2.5})
 
 _MICROGRAY = 1.602176634e-5
@@ -26,7 +27,7 @@ class Spectrum:
     Attributes
     ----------
     energies : array (n,)
-        keV, ascending, from 10 to 1000.
+        keV, ascending, from 1 to 1000.
     photons : array (n,)
         Photons of each energy, per mm^2 and mAs at 1 m from the source, without air between.
     """
@@ -37,8 +38,8 @@ class Spectrum:
     def __post_init__(self) -> None:
         energies = real_array(self.energies, "spectrum: energies", (None,))
         photons = real_array(self.photons, "spectrum: photons", (len(energies),))
-        if not len(energies) or (np.diff(energies) <= 0).any() or energies[0] < 10 or energies[-1] > 1000:
-            raise InputError("spectrum: energies: expected one or more, ascending, from 10 to 1000 keV")
+        if not len(energies) or (np.diff(energies) <= 0).any() or energies[0] < _LOWEST or energies[-1] > 1000:
+            raise InputError("spectrum: energies: expected one or more, ascending, from 1 to 1000 keV")
         if photons.min() < 0 or not photons.any():
             raise InputError("spectrum: photons: expected none below 0, and some above")
         object.__setattr__(self, "energies", freeze(energies))
@@ -52,16 +53,21 @@ class Spectrum:
     @property
     def kerma(self) -> float:
         """Air kerma at 1 m, µGy per mAs; it falls with the square of the distance."""
-        return self._kerma(self.photons)
+        return float(self._kerma_terms(self.photons).sum())
 
     def filtered(self, filters: Mapping[str, float]) -> "Spectrum":
-        """Return the spectrum behind filters: thicknesses, mm, by element ("Al", "Cu", "W" …) or name of `MATERIALS`."""
+        """Return the spectrum behind filters: thicknesses, mm, by element ("Al", "Cu", "W" …) or name of `MATERIALS`.
+
+        The lowest energies below 10 keV are left out where all of them together are less than 1e-6 of the air kerma.
+        """
         photons = self.photons
         for material, thickness in filters.items():
             with naming("filters"):
                 depth = at_least_0(thickness, str(material), "mm") * attenuations(material, self.energies)
             photons = photons * np.exp(-depth)
-        return Spectrum(self.energies, photons)
+        kerma = np.cumsum(self._kerma_terms(photons))
+        is_kept = (self.energies >= _SOFT) | (kerma >= _NEGLIGIBLE * kerma[-1])
+        return Spectrum(self.energies[is_kept], photons[is_kept])
 
     def coarser(self, step: float) -> "Spectrum":
         """Return the spectrum in steps of `step` keV from 0 on, each at its photons' mean energy, for faster computing."""
@@ -85,15 +91,15 @@ class Spectrum:
             raise InputError(f"share: expected between 0 and 1, got {share:g}")
         mu = attenuations(material, self.energies)
         low, high = 0.0, -np.log(share) / mu.min()
-        target = share * self.kerma
+        kerma = self._kerma_terms(self.photons)
         for _ in range(60):
             trial = (low + high) / 2
-            low, high = (trial, high) if self._kerma(self.photons * np.exp(-mu * trial)) > target else (low, trial)
+            low, high = (trial, high) if kerma @ np.exp(-mu * trial) > share * kerma.sum() else (low, trial)
         return float(high)
 
-    def _kerma(self, photons: Floats) -> float:
-        """Return the air kerma, µGy per mAs, of these numbers of photons at the spectrum's energies."""
-        return _MICROGRAY * float(photons @ (self.energies * energy_absorption("air", self.energies)))
+    def _kerma_terms(self, photons: Floats) -> Floats:
+        """Return the air kerma (n,), µGy per mAs, of these numbers of photons of each energy."""
+        return _MICROGRAY * photons * self.energies * energy_absorption("air", self.energies)
 
 
 def tube_spectrum(kvp: float, filters: Mapping[str, float] = _FILTERS, angle: float = _ANGLE) -> Spectrum:
@@ -102,10 +108,11 @@ def tube_spectrum(kvp: float, filters: Mapping[str, float] = _FILTERS, angle: fl
     Parameters
     ----------
     kvp
-        Tube voltage, kV, from 40 to 150.
+        Tube voltage, kV, from 20 to 150.
     filters
         As for `Spectrum.filtered`: all materials between anode and patient, including the equivalent of the tube's window
-        and oil. Air absorbs, too: ``{"Al": 2.5, "air": 1000}``. Photons below 10 keV, which do not leave tubes, are omitted.
+        and oil. Air absorbs, too: ``{"Al": 2.5, "air": 1000}``.
+        Without a filter photons from 1 keV on are there, which do not leave tubes: most of the air kerma is theirs.
     angle
         Anode angle, degrees. Other angles than 12 are calculated by SpekPy, if it is installed.
 
@@ -113,7 +120,7 @@ def tube_spectrum(kvp: float, filters: Mapping[str, float] = _FILTERS, angle: fl
     -------
     Spectrum
         In steps of 0.5 keV, from a table made with SpekPy 2.5 (G. Poludniowski et al., Medical Physics 48 (2021) 3630),
-        interpolated linearly between the table's voltages, which are 2 kV apart.
+        interpolated linearly between the table's voltages, which are 2 kV apart, below 40 kV 1 kV.
 
     Raises
     ------
@@ -128,8 +135,8 @@ def tube_spectrum(kvp: float, filters: Mapping[str, float] = _FILTERS, angle: fl
         raise InputError(f"angle: expected less than 90 degrees, got {angle:g}")
     if angle == _ANGLE:
         energies = np.asarray(_LOWEST + _STEP * (np.arange(photons.shape[1]) + 0.5), np.float64)
-        row = min(int((kvp - voltages[0]) / 2), len(voltages) - 2)
-        fraction = (kvp - voltages[row]) / 2
+        row = min(int(np.searchsorted(voltages, kvp, "right")), len(voltages) - 1) - 1
+        fraction = (kvp - voltages[row]) / (voltages[row + 1] - voltages[row])
         is_present = energies < kvp
         interpolated: Floats = (1 - fraction) * photons[row] + fraction * photons[row + 1]
         unfiltered = Spectrum(energies[is_present], interpolated[is_present])

@@ -23,6 +23,7 @@ from .system import XraySystem
 _BINS = ((20.0, 60.0), (60.0, 120.0))
 _RAYS = 8192  # number of rays computed at once
 _METER = 1000.0  # mm
+_NEGLIGIBLE = 1e-9  # fraction of each bin's counts below which an energy is left out
 
 
 class SpectralTransmission:
@@ -50,6 +51,8 @@ class SpectralTransmission:
 
     Attributes
     ----------
+    spectrum : Spectrum
+        The photons of the n energies that are more than a billionth of a bin's counts without attenuation.
     weights : array (bins, n)
         Expected counts in each bin from the photons of each energy, without attenuation, for 1 mm^2 at 1 m and 1 mAs.
     mu : array (materials, n)
@@ -75,7 +78,6 @@ class SpectralTransmission:
         if not isinstance(views, Views | Scanner | None):
             raise InputError(f"views: expected Views, a scanner or None, got {type(views).__name__}")
         self.views = views.views() if isinstance(views, Scanner) else views
-        self.spectrum = spectrum
         self.materials = (materials,) if isinstance(materials, str) else tuple(materials)
         if not self.materials or len(set(self.materials)) < len(self.materials):
             raise InputError(f"materials: expected one or more, each once, got {', '.join(self.materials) or 'none'}")
@@ -85,8 +87,10 @@ class SpectralTransmission:
         for i, row in enumerate(weights):
             if not row.any():
                 raise InputError(f"bins: no photon reaches bin {i}: expected energies of the spectrum")
-        self.weights = freeze(weights)
-        self.mu = freeze(np.array([attenuations(name, spectrum.energies) for name in self.materials]))
+        is_counted = (weights > _NEGLIGIBLE * weights.sum(axis=1, keepdims=True)).any(axis=0)
+        self.spectrum = Spectrum(spectrum.energies[is_counted], spectrum.photons[is_counted])
+        self.weights = freeze(weights[:, is_counted])
+        self.mu = freeze(np.array([attenuations(name, self.spectrum.energies) for name in self.materials]))
         self._pixels = None if self.views is None else _pixel_factors(self.views)
         self._sigmas = _sigmas(self.views, none_below_0(blur, "blur")) if np.any(blur) else []
         self.background = freeze(none_below_0(background, "background"))

@@ -59,7 +59,7 @@ def test_padding_is_air_and_metal_is_said():
 def test_only_ct_numbers_at_sensible_energies_are_converted():
     zeros = np.zeros(GRID.shape)
     refused(lambda: mph.hu_to_mu(mph.Volume(zeros, GRID, "mu")), "expected a volume of hu, got mu")
-    for energy in (5, 2000, -1, np.nan, "Tc"):
+    for energy in (0.5, 2000, -1, np.nan, "Tc"):
         refused(lambda energy=energy: mph.hu_to_mu(mph.Volume(zeros, GRID, "hu"), energy), "energy")
 
 

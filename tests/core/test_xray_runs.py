@@ -98,7 +98,7 @@ def test_a_reconstruction_is_of_mu_at_70_keV_and_mere_logarithms_are_cupped():
 
 def test_what_cannot_be_is_refused_in_one_line(system):
     for settings, kvp, words in (
-        ({}, 200, "X-ray source 2: kvp: expected 40 to 150 kV, got 200"),
+        ({}, 200, "X-ray source 2: kvp: expected 20 to 150 kV, got 200"),
         ({"model.window": [130, 140]}, 100, "X-ray source 1: bins: no photon reaches bin 0"),
         ({"frames.bins": [20, 60, 50, 90]}, 100, "bins: bins 0 and 1 overlap"),
         ({"frames.bins": [20, 60, 90]}, 100, "frames.bins: expected pairs of energies"),

@@ -17,7 +17,6 @@ from ..geometry.system import PinholeSystem
 from ..geometry.views import Views
 from ..physics.aperture import Opening
 from ..physics.aperture import points_needed as hole_points_needed
-from ..physics.crystal import gaussian_blur, parts_for_blur
 from ..physics.energy_window import FWHM_PER_SIGMA
 from ..physics.isotopes import Isotope
 from ..physics.optics import Edge, Optics
@@ -27,7 +26,7 @@ from ..rays.bundles import Beam
 from ..rays.ray_geometry import Fan, view_rays
 from ..validation import instance, positive, real_array, strict_whole
 from ..volumes.volume import Volume
-from . import emission_warnings
+from . import detector_blur, emission_warnings
 from .model import Model, checked_background, checked_times, require_views_of
 from .photon_lines import checked_mu, checked_photons, line_models, mu_volumes
 from .pixel_points import TOLERANCE, lattices, offsets, points_needed, require_points, shadow_edges
@@ -417,24 +416,11 @@ class Emission(Model):
 
     def pixel_parts(self, views: Views, grid: Grid) -> int:
         """Return the number of parts of a pixel's side that are blurred apart, as many as the module with most needs."""
-        if not np.any(self.intrinsic_fwhm):
-            return 1
-        magnification = self.system.collimator_length / self.system.pinhole_distance
-        hole = 0.0 if self.hole == "point" else self.effective_diameter * (1 + magnification)
-        widths = np.hypot(grid.voxel_volume ** (1 / 3) * magnification, hole)
-        sigmas = [self._optics_of(m).intrinsic_fwhm / FWHM_PER_SIGMA for m in range(len(views))]
-        pixels = [self.crystal_pitch(views, m) for m in range(len(views))]
-        blurs = {(s / p, w / p) for s, w, sides in zip(sigmas, widths.tolist(), pixels, strict=True) for p in sides}
-        return max(parts_for_blur(*blur) for blur in blurs)
+        return detector_blur.pixel_parts(self, views, grid) if np.any(self.intrinsic_fwhm) else 1
 
     def response(self, views: Views, m: int, parts: int) -> tuple[Floats, Floats] | None:
         """Return the matrices of the intrinsic blur of view m, as `Model.response`; None without blur."""
-        if not np.any(self.intrinsic_fwhm):
-            return None
-        sigma = self._optics_of(m).intrinsic_fwhm / FWHM_PER_SIGMA
-        pitch_u, pitch_v = self.crystal_pitch(views, m)
-        n_v, n_u = views.shape
-        return gaussian_blur(n_v, sigma / pitch_v, parts), gaussian_blur(n_u, sigma / pitch_u, parts)
+        return detector_blur.matrices(self, views, m, parts) if np.any(self.intrinsic_fwhm) else None
 
     def by_depth(self, views: Views, grid: Grid) -> PinholeOperator | None:
         """Return the depth-dependent pinhole response, or None if the hole's blur is computed by rays."""

@@ -83,16 +83,3 @@ def point_blur(n: int, sigma: float) -> Floats:
         edges = (np.arange(n + 1) - 0.5) / (sigma * math.sqrt(2))
     kernel = np.diff([0.5 * math.erf(x) for x in edges])
     return kernel[np.abs(np.arange(n)[:, None] - np.arange(n))]
-
-
-def parts_for_blur(sigma: float, width: float) -> int:
-    """Return the number of parts of a pixel's side to blur apart, so that at most 0.3 % of the counts are misplaced.
-
-    Means over whole pixels no longer say where in a pixel an edge was. `sigma` is the blur's standard deviation and `width`
-    the width of an unblurred point's image, a disc, both in pixels. The law was fitted to images of such discs.
-    """
-    if sigma**1.5 < 0.003 * width:
-        return 1
-    variance = width**2 / 16 + sigma**2 + 1 / 12
-    misplaced, widened = 3.3 / (sigma**0.4 * width**0.55) - 0.5, (15 / (width**0.5 * variance)) ** 0.4
-    return min(max(math.ceil(max(misplaced, widened)), 2 if sigma < 0.7 else 1), 10)

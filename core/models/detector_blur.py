@@ -1,0 +1,45 @@
+"""The detector's own blur of emission images: of photons on the crystal, before pixels count them."""
+
+import math
+from typing import Any
+
+import numpy as np
+
+from ..arrays import Floats
+from ..geometry.grid import Grid
+from ..geometry.views import Views
+from ..physics.crystal import gaussian_blur
+from ..physics.energy_window import FWHM_PER_SIGMA
+
+
+def pixel_parts(model: Any, views: Views, grid: Grid) -> int:
+    """Return the number of parts of a pixel's side to blur apart, as many as the module of `Emission` with most needs."""
+    magnification = model.system.collimator_length / model.system.pinhole_distance
+    hole = 0.0 if model.hole == "point" else model.effective_diameter * (1 + magnification)
+    widths = np.hypot(grid.voxel_volume ** (1 / 3) * magnification, hole).tolist()
+    pixels = [(m, side) for m in range(len(views)) for side in model.crystal_pitch(views, m)]
+    return max(_parts(_sigma(model, m) / side, widths[m] / side) for m, side in pixels)
+
+
+def matrices(model: Any, views: Views, m: int, parts: int) -> tuple[Floats, Floats]:
+    """Return the matrices that blur view m of `Emission`, (n_v, n_v parts) along v and (n_u, n_u parts) along u."""
+    (pitch_u, pitch_v), (n_v, n_u), sigma = model.crystal_pitch(views, m), views.shape, _sigma(model, m)
+    return gaussian_blur(n_v, sigma / pitch_v, parts), gaussian_blur(n_u, sigma / pitch_u, parts)
+
+
+def _sigma(model: Any, m: int) -> float:
+    """Return the standard deviation of module m's blur, mm on the crystal."""
+    return float(model._optics_of(m).intrinsic_fwhm) / FWHM_PER_SIGMA
+
+
+def _parts(sigma: float, width: float) -> int:
+    """Return the number of parts of a pixel's side to blur apart, so that at most 0.3 % of the counts are misplaced.
+
+    Means over whole pixels no longer say where in a pixel an edge was. `sigma` is the blur's standard deviation and `width`
+    the width of an unblurred point's image, a disc, both in pixels. The law was fitted to images of such discs.
+    """
+    if sigma**1.5 < 0.003 * width:
+        return 1
+    variance = width**2 / 16 + sigma**2 + 1 / 12
+    misplaced, widened = 3.3 / (sigma**0.4 * width**0.55) - 0.5, (15 / (width**0.5 * variance)) ** 0.4
+    return min(max(math.ceil(max(misplaced, widened)), 2 if sigma < 0.7 else 1), 10)

@@ -12,12 +12,8 @@ from pathlib import Path
 
 import pytest
 
-from mphdrr.core import memory
 from mphdrr.core.phantoms import painting
 from mphdrr.core.workbook import reader
-
-# No test cuts the power: to wait until each small file is on the disk would be most of what some of them take.
-os.fsync = lambda descriptor: None
 
 # Python's search for garbage among a million objects of imported libraries, again and again, would be a sixth of the
 # tests' time: it rests while they are collected, comes less often, and does not look again at what stays after a file of
@@ -86,10 +82,6 @@ reader._read = lambda path, kind, columns: (
     if columns is None and (content := _content(path)) in KNOWN
     else _read(path, kind, columns)
 )
-
-
-# To ask how much memory is free takes as long as many a small projection; who tests just that asks anew.
-memory.available = functools.cache(memory.available)
 
 
 def pytest_sessionfinish(exitstatus: int) -> None:

@@ -23,8 +23,6 @@ from mphdrr.core.events.draws import Dice
 from .conftest import refused
 from .small_events import TEXT, WORKBOOK, small_recipe, with_phantoms
 
-AS_SHIPPED = True  # compared with voxels of every Python
-
 
 @pytest.fixture(scope="module")
 def small(tmp_path_factory) -> events.EventSet:

@@ -18,8 +18,6 @@ from mphdrr.core.runs.settings import SETTINGS
 
 from .conftest import refused, refused_command
 
-AS_SHIPPED = True  # compared with voxels of every Python
-
 DATA = Path(__file__).parent / "data"
 SMALL = ["--voxels", "12", "--spacing", "8", "--size", "6", "8", "--modules", "3-4"]
 COUNTS = ["--emission", "--isotope", "Tc-99m", "--aperture-mu", "tungsten", "--pixel-points", "3", "--tolerance", "9"]

@@ -6,6 +6,7 @@ import importlib.util
 import json
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,16 +14,23 @@ import pytest
 import mphdrr.core as mph
 from mphdrr.addon.cli import main
 
-SMALL = ["--voxels", "24", "--spacing", "4", "--size", "12", "16"]
+from .conftest import FEWER_MODULES, WORKBOOK
+
+SMALL = ["--voxels", "12", "--spacing", "8", "--size", "12", "16"]
 
 
-def test_geometry_show_prints_every_module(workbook, capsys):
-    assert main(["geometry", "show", str(workbook), "--json"]) == 0
+@pytest.fixture(scope="module")
+def workbook() -> Path:
+    return FEWER_MODULES
+
+
+def test_geometry_show_prints_every_module(capsys):
+    assert main(["geometry", "show", str(WORKBOOK), "--json"]) == 0
     modules = json.loads(capsys.readouterr().out)["modules"]
     assert len(modules) == 80
     assert modules[79]["ring"] == 4
     assert modules[0]["l"] == pytest.approx(89.070206162965, abs=1e-8)
-    assert main(["geometry", "show", str(workbook), "--modules", "1-2,80"]) == 0
+    assert main(["geometry", "show", str(WORKBOOK), "--modules", "1-2,80"]) == 0
     assert len(capsys.readouterr().out.splitlines()) == 5
 
 
@@ -52,7 +60,7 @@ def test_from_phantom_to_dataset(workbook, tmp_path, capsys):
     assert list(back.system.numbers) == [1, 2, 3, 4, 5]
     expected = mph.Projector(back.volume.grid, back.views)(mph.read_volume(volume))
     assert np.allclose(back.projections, expected)
-    assert back.workbook == "dc-spect-80.xlsx"
+    assert back.workbook == "first-24-modules.xlsx"
     assert len(back.workbook_sha256) == 64
     assert (tmp_path / "m.png").stat().st_size > 0
 
@@ -175,9 +183,9 @@ def test_options_without_effect_are_refused(options, said, tmp_path, capsys):
     ("command", "said"),
     [
         (["geometry", "show", "none.xlsx"], "none.xlsx"),
-        (["geometry", "show", "WORKBOOK", "--modules", "90"], "there are 1 to 80"),
+        (["geometry", "show", "WORKBOOK", "--modules", "90"], "there are 1 to 24"),
         (["geometry", "show", "WORKBOOK", "--modules", "a-b"], "expected numbers such as"),
-        (["geometry", "show", "WORKBOOK", "--modules", "40-1"], "ends before it begins"),
+        (["geometry", "show", "WORKBOOK", "--modules", "20-1"], "ends before it begins"),
         (["phantom", "derenzo", "-o", "FOLDER/a.stl"], "expected a name ending in"),
         (["phantom", "derenzo", "--radius", "-1", "-o", "FOLDER/a.npz"], "Derenzo radius"),
         (["phantom", "derenzo", "--voxels", "99999", "-o", "FOLDER/a.npz"], "of memory"),
@@ -269,7 +277,7 @@ def test_geometry_performance_adds_up(workbook, capsys):
     )
     assert [m["sensitivity"] for m in printed["modules"]] == pytest.approx(1e6 * expected[0])
     assert printed["total"]["sensitivity"] == pytest.approx(1e6 * expected.sum())
-    assert printed["total"]["modules_holding_roi"] == 80
+    assert printed["total"]["modules_holding_roi"] == 24
     assert all(m["roi_radius_seen"] == pytest.approx(75, abs=1e-3) for m in printed["modules"])
     named = ["--aperture-mu", "tungsten", "--crystal-mu", "CZT", "--isotope", "Tc-99m", "--json"]
     assert main(["geometry", "performance", str(workbook), *named]) == 0
@@ -280,7 +288,7 @@ def test_geometry_performance_adds_up(workbook, capsys):
     assert main(["geometry", "performance", str(workbook), "--opening-angle", "200"]) == 1
     assert "--opening-angle: expected less than 180 degrees, got 200" in capsys.readouterr().err
     assert main(["geometry", "performance", str(workbook), "--point", "0", "0", "900"]) == 0
-    assert "from 0 of 80 modules" in capsys.readouterr().out
+    assert "from 0 of 24 modules" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("quantity", ["sensitivity", "modules", "resolution", "completeness"])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import importlib.util
 import os
 import re
@@ -59,10 +60,16 @@ def workbook() -> Path:
     return WORKBOOK
 
 
+@functools.cache
+def dc_spect() -> PinholeSystem:
+    """Return the users' scanner of 80 modules, read once."""
+    return read_system(WORKBOOK)
+
+
 @pytest.fixture(scope="session")
 def scanner() -> PinholeSystem:
     """Return the users' scanner of 80 modules."""
-    return read_system(WORKBOOK)
+    return dc_spect()
 
 
 @pytest.fixture

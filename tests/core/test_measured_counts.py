@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+from pathlib import Path
 
 import h5py
 import numpy as np
@@ -15,13 +16,18 @@ from mphdrr.core.runs.mosaic import counts_caption, module_labels
 from mphdrr.core.runs.recipe import recorded_recipe
 
 from . import dicom_files
-from .conftest import refused, refused_command
+from .conftest import FEWER_MODULES, refused, refused_command
 
 SPHERE = "[[shape]]\nkind = 'sphere'\nradius = 30\nactivity = 5\nmu = 0.015\n"
 SMALL = {
     "phantom.text": SPHERE, "phantom.voxels": 12, "model.kind": "emission", "model.time": 30.0, "model.pixel_points": 2,
     "model.tolerance": 9.0, "detector.rows": 5, "detector.columns": 6, "detector.plane": "real",
 }  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def workbook() -> Path:
+    return FEWER_MODULES
 
 
 @pytest.mark.parametrize("entries", [

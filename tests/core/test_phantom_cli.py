@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 import mphdrr.core as mph
 from mphdrr.core.cli import main
+
+from .conftest import FEWER_MODULES
 
 THORAX = """
 name = "thorax"
@@ -30,6 +33,11 @@ def one(shape: mph.Shape) -> mph.ShapePhantom:
 
 
 NUMPY = ["--size", "9", "9", "--backend", "numpy"]
+
+
+@pytest.fixture(scope="module")
+def workbook() -> Path:
+    return FEWER_MODULES
 
 
 @pytest.mark.parametrize(
@@ -143,7 +151,7 @@ def test_a_beating_heart_is_a_run_for_each_state(workbook, tmp_path, capsys, mon
     assert [state.array.max() for state in states] == [1, 1.5] and states[0].grid == states[1].grid
 
     files = [str(tmp_path / f"beat-{k}.npz") for k in (1, 2)]
-    project = ["project", str(workbook), *NUMPY, "--modules", "30", "--emission", "--hole", "point", "--center"]
+    project = ["project", str(workbook), *NUMPY, "--modules", "20", "--emission", "--hole", "point", "--center"]
     more = ["--noise", "5", "--mosaic", str(tmp_path / "m.png")]
     assert main([*project, "--states", *files, *more, "-o", str(tmp_path / "run.npz")]) == 0
     for k, file in enumerate(files):

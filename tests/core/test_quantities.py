@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,10 +17,17 @@ from mphdrr.core.runs.projecting import project_run
 from mphdrr.core.volumes.volume import UNITS
 from mphdrr.core.volumes.volume_files import write_volume
 
+from .conftest import FEWER_MODULES
+
 GRID = mph.Grid.centered(6, 12.0)
 LINES = {"activity", "mu"}
 CONVERSION = r"hu_to_mu\(volume, energy\), `mphdrr volume convert FILE --to-mu --energy KEV`, or CT to Attenuation"
 SMALL = ["--size", "6", "5", "--modules", "3-4", "--backend", "numpy"]
+
+
+@pytest.fixture(scope="module")
+def workbook() -> Path:
+    return FEWER_MODULES
 
 
 def volume_of(quantity: str) -> mph.Volume:

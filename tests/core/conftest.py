@@ -26,10 +26,10 @@ from mphdrr.core.recording import recorded_warnings
 from mphdrr.core.volumes.volume import Volume
 from mphdrr.core.workbook import read_system
 
-from .small_events import WORKBOOK as FEWER_MODULES
 from .small_events import small_recipe
 
 WORKBOOK = Path(__file__).parents[2] / "examples" / "dc-spect-80.xlsx"
+FEWER_MODULES = Path(__file__).parent / "data" / "first-24-modules.xlsx"
 
 needs_torch = pytest.mark.skipif(importlib.util.find_spec("torch") is None, reason="torch is not installed")
 BACKENDS = ["numpy", pytest.param("torch", marks=needs_torch), "cpu"]

@@ -122,10 +122,9 @@ def _neighbors(layers: Sequence[Layer]) -> Iterator[list[int]]:
 def _overlaps(layers: Sequence[Layer], number: int, neighbors: Sequence[int]) -> dict[int, float]:
     """Return fractions of the volume of layer `number`, by the numbers of the larger layers that it overlaps.
 
-    `neighbors` are the numbers of the layers that it may overlap.
-
-    For a layer above, it is the fraction in which that layer is the first to replace this one; for a layer beneath, the
-    fraction in which that layer's value is visible before this one is painted. Overlaps of a lower value 0 are left out.
+    `neighbors` are the numbers of the layers that it may overlap. For a layer above, it is the fraction in which that layer
+    is the first to replace this one; for a layer beneath, the fraction in which that layer's value is visible before this
+    one is painted. Overlaps of a lower value 0 are left out.
     """
     layer = layers[number]
     relations = {k: layers[k].relation(layer) for k in neighbors}

@@ -1,7 +1,6 @@
 """Memory and processor cores that this job may use, and checks that its arrays fit before it begins."""
 
 import functools
-import itertools
 import os
 from math import ceil
 from pathlib import Path
@@ -26,17 +25,20 @@ def available() -> int:
     """
     import psutil
 
-    machine, process = psutil.virtual_memory(), psutil.Process()
+    machine = psutil.virtual_memory()
     free = [int(machine.available)]
-    for group, limit_file in itertools.product(_control_groups("memory"), _LIMITS):
-        limit = _read_text(group / limit_file)
+    for file in _limit_files():
+        limit = _read_text(file)
         if limit.isdigit() and int(limit) < machine.total:
-            stat = dict(line.split() for line in _read_text(group / "memory.stat").splitlines())
+            stat = dict(line.split() for line in _read_text(file.with_name("memory.stat")).splitlines())
             # The page cache is freed when memory is needed. In version 1 the total includes the groups below.
             cache = stat.get("total_inactive_file", stat.get("inactive_file", 0))
-            free.append(int(limit) - int(_read_text(group / _LIMITS[limit_file])) + int(cache))
-    if hasattr(psutil, "RLIMIT_AS") and (space := process.rlimit(psutil.RLIMIT_AS)[0]) != psutil.RLIM_INFINITY:
-        free.append(space - process.memory_info().vms)
+            free.append(int(limit) - int(_read_text(file.with_name(_LIMITS[file.name]))) + int(cache))
+    if hasattr(psutil, "RLIMIT_AS"):
+        from resource import RLIM_INFINITY, RLIMIT_AS, getrlimit  # quicker than those of a `psutil.Process`
+
+        if (space := getrlimit(RLIMIT_AS)[0]) != RLIM_INFINITY:
+            free.append(space - psutil.Process().memory_info().vms)
     return max(0, min(free))
 
 
@@ -50,6 +52,13 @@ def cores() -> int:
         if quota.isdigit():  # "max", and -1 in version 1, is no limit
             limits.append(ceil(int(quota) / int(period)))
     return max(1, min(limits))
+
+
+@functools.cache
+def _limit_files() -> list[Path]:
+    """Return the files that hold the memory limits of this process's control groups."""
+    files = (group / name for group in _control_groups("memory") for name in _LIMITS)
+    return [file for file in files if os.access(file, os.R_OK)]
 
 
 @functools.cache

@@ -1,9 +1,8 @@
-"""What all tests share."""
+"""What all tests share. They run the product as users get it: nothing of it is replaced here."""
 
 from __future__ import annotations
 
 import atexit
-import functools
 import gc
 import os
 import shutil
@@ -11,13 +10,6 @@ import sys
 from pathlib import Path
 
 import pytest
-
-from mphdrr.core import memory
-from mphdrr.core.phantoms import painting
-from mphdrr.core.workbook import reader
-
-# No test cuts the power: to wait until each small file is on the disk would be most of what some of them take.
-os.fsync = lambda descriptor: None
 
 # Python's search for garbage among a million objects of imported libraries, again and again, would be a sixth of the
 # tests' time: it rests while they are collected, comes less often, and does not look again at what stays after a file of
@@ -54,42 +46,6 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
         _file = item.path
         gc.collect()
         gc.freeze()
-        vars(painting).update(SHIPPED if getattr(item.module, "AS_SHIPPED", False) else FEWER)
-
-
-# A phantom's voxels take a hundredth of their samples. A file of tests of just such numbers, or that compares with another
-# process, says AS_SHIPPED = True.
-FEWER = {
-    "_MIN_SAMPLES": 16,
-    "_MAX_SAMPLES": 1 << 7,
-    "_SAMPLES_OF_MIXED": 1 << 14,
-    "_SAMPLES_OF_FEW": 1 << 6,
-    "_SAMPLES_OF_OVERLAP": 1 << 13,
-}
-SHIPPED = {name: getattr(painting, name) for name in FEWER}
-
-
-# Workbooks are read thousands of times in a process: the cells of those read last are kept, and all that two of them give,
-# wherever they are, which cannot be changed, but a kind's columns can.
-def _content(path: str | os.PathLike[str]) -> bytes:
-    return Path(path).read_bytes() if os.path.isfile(path) else b""  # of a pipe nothing would come
-
-
-ROOT = Path(__file__).parents[1]
-KNOWN = {_content(ROOT / name) for name in ("examples/dc-spect-80.xlsx", "tests/core/data/first-24-modules.xlsx")}
-_Book, _read = reader.Book, reader._read
-_kept_book = functools.lru_cache(32)(lambda path, content: _Book(path))
-_kept_system = functools.cache(lambda path, content, kind, columns: _read(path, kind, None))
-reader.Book = lambda path: _kept_book(Path(path), content) if (content := _content(path)) else _Book(path)
-reader._read = lambda path, kind, columns: (
-    _kept_system(Path(path), content, kind, tuple(kind.columns))
-    if columns is None and (content := _content(path)) in KNOWN
-    else _read(path, kind, columns)
-)
-
-
-# To ask how much memory is free takes as long as many a small projection; who tests just that asks anew.
-memory.available = functools.cache(memory.available)
 
 
 def pytest_sessionfinish(exitstatus: int) -> None:

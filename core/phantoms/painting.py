@@ -103,21 +103,31 @@ def mean_changes(layers: Sequence[Layer]) -> list[float]:
     of either, and the content of a layer that is covered completely vanishes completely.
     """
     changes = [layer.value for layer in layers]
-    for number, layer in enumerate(layers):
-        for k, fraction in _overlaps(layers, number).items():
+    for number, (layer, neighbors) in enumerate(zip(layers, _neighbors(layers), strict=True)):
+        for k, fraction in _overlaps(layers, number, neighbors).items():
             upper, lower = max(number, k), min(number, k)
             changes[upper] -= fraction * layer.volume * layers[lower].value / layers[upper].volume
     return changes
 
 
-def _overlaps(layers: Sequence[Layer], number: int) -> dict[int, float]:
+def _neighbors(layers: Sequence[Layer]) -> Iterator[list[int]]:
+    """Yield for each layer the numbers, ascending, of the other layers whose enclosing balls overlap its own."""
+    centers = np.array([layer.pose[:3, 3] for layer in layers]).reshape(-1, 3)
+    radii = np.array([layer.shape.ball_radius * np.linalg.norm(layer.pose[:3, :3], 2) for layer in layers])
+    for i in range(len(layers)):
+        overlap = np.linalg.norm(centers - centers[i], axis=1) < radii + radii[i]
+        yield [k for k in np.flatnonzero(overlap).tolist() if k != i]
+
+
+def _overlaps(layers: Sequence[Layer], number: int, neighbors: Sequence[int]) -> dict[int, float]:
     """Return fractions of the volume of layer `number`, by the numbers of the larger layers that it overlaps.
 
-    For a layer above, it is the fraction in which that layer is the first to replace this one; for a layer beneath, the
-    fraction in which that layer's value is visible before this one is painted. Overlaps of a lower value 0 are left out.
+    `neighbors` are the numbers of the layers that it may overlap. For a layer above, it is the fraction in which that layer
+    is the first to replace this one; for a layer beneath, the fraction in which that layer's value is visible before this
+    one is painted. Overlaps of a lower value 0 are left out.
     """
     layer = layers[number]
-    relations = {k: candidate.relation(layer) for k, candidate in enumerate(layers) if k != number}
+    relations = {k: layers[k].relation(layer) for k in neighbors}
     above = [k for k, relation in relations.items() if k > number and relation >= 0 and not layers[k].adds]
     beneath = [k for k, relation in relations.items() if k < number and relation >= 0 and not layer.adds][::-1]
     larger = [k for k in (*above, *beneath) if (layers[k].volume, k) > (layer.volume, number)]
@@ -143,12 +153,9 @@ def _overlaps(layers: Sequence[Layer], number: int) -> dict[int, float]:
 
 def _visible_layers(layers: Sequence[Layer]) -> Iterator[list[Layer]]:
     """Yield for each layer the layers beneath it that may be visible inside its shape; none for a layer that adds."""
-    centers = np.array([layer.pose[:3, 3] for layer in layers]).reshape(-1, 3)
-    radii = np.array([layer.shape.ball_radius * np.linalg.norm(layer.pose[:3, :3], 2) for layer in layers])
-    for i, layer in enumerate(layers):
-        near = np.linalg.norm(centers[:i] - centers[i], axis=1) < radii[:i] + radii[i]
+    for i, (layer, neighbors) in enumerate(zip(layers, _neighbors(layers), strict=True)):
         visible: list[Layer] = []
-        for j in np.flatnonzero(near).tolist() if not layer.adds else ():
+        for j in [k for k in neighbors if k < i and not layer.adds]:
             relation = layers[j].relation(layer)
             if relation == 1 and not layers[j].adds:
                 visible = []

@@ -213,14 +213,16 @@ def _power(base: float, exponent: float) -> float:
 
 
 _COMPARISONS = {"=": "eq", "<>": "ne", "<": "lt", "<=": "le", ">": "gt", ">=": "ge"}  # names in `operator`
-# From loosest to tightest; all group from the left, and a sign in front binds tighter: -2^2 is 4.
-_OPERATORS: list[dict[str, Callable[[Any, Any], Any]]] = [
-    {sign: _comparison(getattr(operator, name)) for sign, name in _COMPARISONS.items()},
-    {"&": lambda a, b: _to_text(a) + _to_text(b)},
-    {"+": _number_operator(_add), "-": _number_operator(lambda a, b: _add(a, -b))},
-    {"*": _number_operator(operator.mul), "/": _number_operator(operator.truediv)},
-    {"^": _number_operator(_power)},
-]
+# How tightly each binds, and its function. All group from the left, and a sign in front binds tighter: -2^2 is 4.
+_OPERATORS: dict[str, tuple[int, Callable[[Any, Any], Any]]] = {
+    **{sign: (0, _comparison(getattr(operator, name))) for sign, name in _COMPARISONS.items()},
+    "&": (1, lambda a, b: _to_text(a) + _to_text(b)),
+    "+": (2, _number_operator(_add)),
+    "-": (2, _number_operator(lambda a, b: _add(a, -b))),
+    "*": (3, _number_operator(operator.mul)),
+    "/": (3, _number_operator(operator.truediv)),
+    "^": (4, _number_operator(_power)),
+}
 
 
 def _atan2(x: float, y: float) -> float:
@@ -377,12 +379,14 @@ class FormulaParser:
         self.take()
 
     def operation(self, level: int) -> _Term:
-        """Parse operands joined by the operators of `_OPERATORS[level]` and of the levels that bind tighter."""
-        if level == len(_OPERATORS):
-            return self.signed_operand()
-        term = self.operation(level + 1)
-        while self.is_next("OPERATOR-INFIX") and self.tokens[self.index].value in _OPERATORS[level]:
-            term = _apply(_OPERATORS[level][self.take().value], term, self.operation(level + 1))
+        """Parse operands joined by operators that bind as tightly as `level`, or tighter."""
+        term = self.signed_operand()
+        while self.is_next("OPERATOR-INFIX") and (sign := self.tokens[self.index].value) in _OPERATORS:
+            binding, function = _OPERATORS[sign]
+            if binding < level:
+                break
+            self.take()
+            term = _apply(function, term, self.operation(binding + 1))
         return term
 
     def signed_operand(self) -> _Term:

@@ -19,7 +19,9 @@ from mphdrr.core.events.templates import TEMPLATES
 from mphdrr.core.runs.files import read_run
 from mphdrr.core.workbook import read_system
 
-from .conftest import WORKBOOK, cancelled, refused, reopened
+from .conftest import cancelled, refused, reopened
+
+WORKBOOK = Path(__file__).parents[1] / "core" / "data" / "first-24-modules.xlsx"
 
 TEXT = f"""
 version = 1
@@ -48,6 +50,7 @@ odds = 0.5
 disks = {{ from = 2, to = 4 }}
 disk_radius = 30
 spacing_of_disks = 14
+margin = 0
 [models.lines]
 kind = "transmission"
 [models.counts]

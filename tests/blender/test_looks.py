@@ -15,6 +15,7 @@ from mphdrr.addon.scanner import maps, scanner
 from mphdrr.addon.volumes import looks, slices, volume_materials, volumes
 from mphdrr.core.geometry.grid import Grid
 from mphdrr.core.geometry.part_colors import LOOKS
+from mphdrr.core.phantoms.nema import NemaBody
 from mphdrr.core.physics.ct_numbers import hu_to_mu
 from mphdrr.core.physics.maps import sensitivity_map
 from mphdrr.core.physics.materials import attenuation
@@ -24,10 +25,14 @@ from mphdrr.core.volumes.volume import Volume
 from .conftest import datablocks, refused, reopened, slice_pixels, update
 
 
+@pytest.fixture(scope="module")
+def body() -> Volume:
+    return NemaBody().voxelize(Grid.centered(64, 4.8))
+
+
 @pytest.fixture
-def nema(scene):
-    bpy.ops.mphdrr.add_nema(voxels=64)
-    return bpy.context.object
+def nema(scene, body):
+    return volumes.add_volume(body, "NEMA Body")
 
 
 def surface(item) -> tuple[np.ndarray, np.ndarray]:
@@ -108,7 +113,9 @@ def test_a_look_from_the_asset_library_restyles_a_volume_and_its_slices(nema, tm
 
 
 @pytest.mark.long
-def test_a_surface_follows_a_phantom_that_changes(nema):
+def test_a_surface_follows_a_phantom_that_changes(scene):
+    bpy.ops.mphdrr.add_nema(voxels=64)
+    nema = bpy.context.object
     settings = nema.mphdrr_volume
     settings.look = "SHELL"
     _, edges = surface(nema)

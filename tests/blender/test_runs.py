@@ -106,7 +106,7 @@ def test_what_does_not_change_the_images_leaves_the_run_current(render, scene):
     phantom().name = "Cold rods"
     scene.mphdrr_display.colors = "GREY"
     set_(backend="NUMPY")
-    bpy.ops.mphdrr.add_nema(voxels=12)
+    bpy.ops.mphdrr.add_shepp_logan(voxels=12)
     update()
     assert runs.changes(scene) == [] and runs.volume_to_render(scene) == "Cold rods"
 

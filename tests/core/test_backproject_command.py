@@ -14,7 +14,7 @@ from .conftest import refused_command, stop
 
 COUNTS = {"model.kind": "emission", "model.time": 60.0, "model.hole": "point", "model.pixel_points": 1,
           "model.tolerance": 1e9, "detector.rows": 24, "detector.columns": 20, "detector.plane": "real",
-          "phantom.kind": "derenzo", "phantom.voxels": 30}  # fmt: skip
+          "phantom.kind": "derenzo", "phantom.voxels": 30, "phantom.rod_diameters": [10, 8, 10, 8, 9, 7]}  # fmt: skip
 REAL = {"model.isotope": "Tc-99m", "model.aperture_mu": "tungsten", "model.crystal_mu": "NaI", "model.background": 2.5}
 SMALL = ["--voxels", "18", "17", "16", "--spacing", "4", "--center", "3", "2", "1"]
 GRID = mph.Grid.centered((18, 17, 16), 4.0, (3, 2, 1))

@@ -11,8 +11,6 @@ from mphdrr.core.reconstruction.priors import Penalty
 
 from .conftest import refused
 
-AS_SHIPPED = True  # its bounds are of these counts
-
 PRIORS = [mph.Quadratic(0.1), mph.RelativeDifference(2.0), mph.TotalVariation(1.0, edge=5.0)]
 
 

@@ -13,23 +13,25 @@ import pytest
 import mphdrr.core as mph
 from mphdrr.addon.cli import main
 
-SMALL = ["--voxels", "24", "--spacing", "4", "--size", "12", "16"]
+from .conftest import WORKBOOK
+
+SMALL = ["--voxels", "12", "--spacing", "8", "--size", "12", "16"]
 
 
-def test_geometry_show_prints_every_module(workbook, capsys):
-    assert main(["geometry", "show", str(workbook), "--json"]) == 0
+def test_geometry_show_prints_every_module(capsys):
+    assert main(["geometry", "show", str(WORKBOOK), "--json"]) == 0
     modules = json.loads(capsys.readouterr().out)["modules"]
     assert len(modules) == 80
     assert modules[79]["ring"] == 4
     assert modules[0]["l"] == pytest.approx(89.070206162965, abs=1e-8)
-    assert main(["geometry", "show", str(workbook), "--modules", "1-2,80"]) == 0
+    assert main(["geometry", "show", str(WORKBOOK), "--modules", "1-2,80"]) == 0
     assert len(capsys.readouterr().out.splitlines()) == 5
 
 
-def test_geometry_check_names_cells_that_disagree(workbook, tmp_path, capsys):
+def test_geometry_check_names_cells_that_disagree(small_workbook, tmp_path, capsys):
     import openpyxl
 
-    book = openpyxl.load_workbook(workbook)
+    book = openpyxl.load_workbook(small_workbook)
     book["Coordinates"]["G5"] = 99.0
     book.save(tmp_path / "a.xlsx")
     assert main(["geometry", "check", str(tmp_path / "a.xlsx"), "--json"]) == 0
@@ -38,12 +40,12 @@ def test_geometry_check_names_cells_that_disagree(workbook, tmp_path, capsys):
     assert any("G5" in text and "99" in text for text in warnings)
 
 
-def test_from_phantom_to_dataset(workbook, tmp_path, capsys):
+def test_from_phantom_to_dataset(small_workbook, tmp_path, capsys):
     volume, run = tmp_path / "derenzo.nii.gz", tmp_path / "new" / "run.h5"
     phantom = ["--voxels", "24", "--spacing", "4", "--euler", "10", "20", "30", "--position", "1", "2", "3"]
     assert main(["phantom", "derenzo", *phantom, "-o", str(volume)]) == 0
     options = ["--volume", str(volume), *SMALL[4:], "--modules", "1-5", "--mosaic", str(tmp_path / "m.png")]
-    assert main(["project", str(workbook), *options, "-o", str(run)]) == 0
+    assert main(["project", str(small_workbook), *options, "-o", str(run)]) == 0
     assert main(["export", str(run), "-o", str(tmp_path / "run.npz")]) == 0
     capsys.readouterr()
 
@@ -52,7 +54,7 @@ def test_from_phantom_to_dataset(workbook, tmp_path, capsys):
     assert list(back.system.numbers) == [1, 2, 3, 4, 5]
     expected = mph.Projector(back.volume.grid, back.views)(mph.read_volume(volume))
     assert np.allclose(back.projections, expected)
-    assert back.workbook == "dc-spect-80.xlsx"
+    assert back.workbook == "first-24-modules.xlsx"
     assert len(back.workbook_sha256) == 64
     assert (tmp_path / "m.png").stat().st_size > 0
 
@@ -66,29 +68,29 @@ def test_from_phantom_to_dataset(workbook, tmp_path, capsys):
         (["--spacing", "0.5"], "of the Derenzo phantom lies outside the grid"),
     ],
 )
-def test_what_would_not_be_seen_is_said(options, said, workbook, tmp_path, capsys):
+def test_what_would_not_be_seen_is_said(options, said, small_workbook, tmp_path, capsys):
     words = [*("--voxels", "24"), *SMALL[4:], *options, "-o", str(tmp_path / "run.h5")]
-    assert main(["project", str(workbook), *words]) == 0
+    assert main(["project", str(small_workbook), *words]) == 0
     error = capsys.readouterr().err
     assert said in error if said else not error
 
 
-def test_runs_record_what_the_phantom_was(workbook, tmp_path):
+def test_runs_record_what_the_phantom_was(small_workbook, tmp_path):
     options = [*SMALL, "--radius", "30", "--euler", "10", "20", "30", "-o", str(tmp_path / "run.npz")]
-    assert main(["project", str(workbook), *options]) == 0
+    assert main(["project", str(small_workbook), *options]) == 0
     recipe = mph.read_run(tmp_path / "run.npz").recipe
     assert (recipe["phantom.kind"], recipe["phantom.radius"], recipe["phantom.activity"]) == ("derenzo", 30, 100)
     assert recipe["phantom.euler_degrees"] == pytest.approx((10, 20, 30))
     np.testing.assert_allclose(recipe["phantom.matrix"], mph.euler_pose(*np.deg2rad([10, 20, 30])))
 
 
-def test_counts_with_attenuation_and_noise(workbook, tmp_path, capsys):
+def test_counts_with_attenuation_and_noise(small_workbook, tmp_path, capsys):
     grid = mph.Grid.centered(8, 20.0)
     mph.write_volume(mph.Volume(np.full((8, 8, 8), 0.0154), grid, "mu"), tmp_path / "mu.nii")
     options = [*SMALL, "--modules", "3-4", "--emission", "--time", "600", "--mu", str(tmp_path / "mu.nii")]
     options += ["--aperture-points", "3"]
     for name, more in (("mean", []), ("drawn", ["--noise", "5"])):
-        assert main(["project", str(workbook), *options, *more, "-o", str(tmp_path / f"{name}.h5")]) == 0
+        assert main(["project", str(small_workbook), *options, *more, "-o", str(tmp_path / f"{name}.h5")]) == 0
         assert "counts" in capsys.readouterr().out
     mean, drawn = (mph.read_run(tmp_path / f"{name}.h5") for name in ("mean", "drawn"))
     assert mean.unit == drawn.unit == "counts" and (mean.seed, drawn.seed) == (None, 5)
@@ -101,7 +103,7 @@ def test_counts_with_attenuation_and_noise(workbook, tmp_path, capsys):
 
 
 @pytest.mark.long
-def test_every_part_of_the_emission_model_is_an_option(workbook, tmp_path):
+def test_every_part_of_the_emission_model_is_an_option(small_workbook, tmp_path):
     """Options reach the model and the record; for omitted ones the model's defaults hold."""
     run_file = tmp_path / "run.h5"
     options = (
@@ -109,7 +111,7 @@ def test_every_part_of_the_emission_model_is_an_option(workbook, tmp_path):
         "--edge path --within-cone --within-walls --within-crystal --crystal-mu 0.3 --depth-layers 2 --intrinsic-fwhm 3"
     )
     words = [*SMALL, "--modules", "3-4", *options.split(), "-o", str(run_file)]
-    assert main(["project", str(workbook), *words]) == 0
+    assert main(["project", str(small_workbook), *words]) == 0
     run = mph.read_run(run_file)
     model = mph.Emission(
         run.system, isotope="Tl-201", window=(60, 80), time=300, aperture_points=3, aperture_mu="lead",
@@ -123,16 +125,16 @@ def test_every_part_of_the_emission_model_is_an_option(workbook, tmp_path):
     assert (run.recipe["model.aperture_mu"], run.recipe["model.crystal_mu"]) == ("lead", 0.3)  # as requested
 
 
-def test_radiographs_of_mu_and_the_inverse_square_sum(workbook, tmp_path):
+def test_radiographs_of_mu_and_the_inverse_square_sum(small_workbook, tmp_path):
     grid = mph.Grid.centered(8, 10.0)
     mph.write_volume(mph.Volume(np.full((8, 8, 8), 0.0154), grid, "mu"), tmp_path / "mu.nii")
     words = [*SMALL[-3:], "--modules", "3-4", "--volume", str(tmp_path / "mu.nii"), "-o", str(tmp_path / "run.h5")]
-    assert main(["project", str(workbook), *words, "--photons", "1000", "--noise", "2"]) == 0
+    assert main(["project", str(small_workbook), *words, "--photons", "1000", "--noise", "2"]) == 0
     run = mph.read_run(tmp_path / "run.h5")
     lines = mph.Projector(grid, run.views)(run.volume)
     assert lines.any() and (run.unit, run.seed, run.settings["photons"]) == ("photons", 2, 1000)
     np.testing.assert_array_equal(run.projections, mph.sample_counts(mph.intensity(lines, 1000), 2))
-    assert main(["project", str(workbook), *words, "--inverse-square"]) == 0
+    assert main(["project", str(small_workbook), *words, "--inverse-square"]) == 0
     run = mph.read_run(tmp_path / "run.h5")
     assert run.settings["model"] == "inverse square sum"
     expected = mph.Projector(grid, run.views, mph.InverseSquareSum(run.system))(run.volume)
@@ -175,9 +177,9 @@ def test_options_without_effect_are_refused(options, said, tmp_path, capsys):
     ("command", "said"),
     [
         (["geometry", "show", "none.xlsx"], "none.xlsx"),
-        (["geometry", "show", "WORKBOOK", "--modules", "90"], "there are 1 to 80"),
+        (["geometry", "show", "WORKBOOK", "--modules", "90"], "there are 1 to 24"),
         (["geometry", "show", "WORKBOOK", "--modules", "a-b"], "expected numbers such as"),
-        (["geometry", "show", "WORKBOOK", "--modules", "40-1"], "ends before it begins"),
+        (["geometry", "show", "WORKBOOK", "--modules", "20-1"], "ends before it begins"),
         (["phantom", "derenzo", "-o", "FOLDER/a.stl"], "expected a name ending in"),
         (["phantom", "derenzo", "--radius", "-1", "-o", "FOLDER/a.npz"], "Derenzo radius"),
         (["phantom", "derenzo", "--voxels", "99999", "-o", "FOLDER/a.npz"], "of memory"),
@@ -205,8 +207,8 @@ def test_options_without_effect_are_refused(options, said, tmp_path, capsys):
         (["export", "WORKBOOK", "-o", "FOLDER/a.npz"], "expected a name ending in"),
     ],
 )
-def test_users_errors_are_one_line_with_status_1_and_leave_nothing(command, said, workbook, tmp_path, capsys):
-    words = [word.replace("WORKBOOK", str(workbook)).replace("FOLDER", str(tmp_path)) for word in command]
+def test_users_errors_are_one_line_with_status_1_and_leave_nothing(command, said, small_workbook, tmp_path, capsys):
+    words = [word.replace("WORKBOOK", str(small_workbook)).replace("FOLDER", str(tmp_path)) for word in command]
     assert main(words) == 1
     error = capsys.readouterr().err
     assert said in error
@@ -214,9 +216,9 @@ def test_users_errors_are_one_line_with_status_1_and_leave_nothing(command, said
     assert not list(tmp_path.iterdir())
 
 
-def test_export_checks_every_name_before_it_writes(workbook, tmp_path, capsys):
+def test_export_checks_every_name_before_it_writes(small_workbook, tmp_path, capsys):
     run, first = str(tmp_path / "run.npz"), tmp_path / "first.npz"
-    assert main(["project", str(workbook), *SMALL, "-o", run]) == 0
+    assert main(["project", str(small_workbook), *SMALL, "-o", run]) == 0
     assert main(["export", run, "-o", str(first), "-o", str(tmp_path / "second.stl")]) == 1
     assert "second.stl: expected a name ending in" in capsys.readouterr().err
     assert not first.exists()
@@ -239,14 +241,14 @@ def test_every_help_has_an_example(command, capsys):
     assert "example: mphdrr" in capsys.readouterr().out
 
 
-def test_an_interrupt_leaves_nothing(workbook, tmp_path, monkeypatch, capsys):
+def test_an_interrupt_leaves_nothing(small_workbook, tmp_path, monkeypatch, capsys):
     from mphdrr.core.runs import run_recipe
 
     def interrupted(*_, **__):
         raise KeyboardInterrupt
 
     monkeypatch.setattr(run_recipe, "project_run", interrupted)
-    assert main(["project", str(workbook), *SMALL, "-o", str(tmp_path / "run.h5")]) == 130
+    assert main(["project", str(small_workbook), *SMALL, "-o", str(tmp_path / "run.h5")]) == 130
     assert "cancelled" in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
 
@@ -260,50 +262,50 @@ def test_the_package_is_imported_without_its_heavy_parts():
     subprocess.run([sys.executable, "-c", code], check=True)
 
 
-def test_geometry_performance_adds_up(workbook, capsys):
+def test_geometry_performance_adds_up(small_workbook, capsys):
     options = ["--aperture-mu", "3.6", "--crystal-mu", "0.404", "--intrinsic-fwhm", "3", "--isotope", "Tc-99m"]
-    assert main(["geometry", "performance", str(workbook), *options, "--json"]) == 0
+    assert main(["geometry", "performance", str(small_workbook), *options, "--json"]) == 0
     printed = json.loads(capsys.readouterr().out)
     expected = mph.sensitivity(
-        mph.read_system(workbook), [[0, 0, 0]], aperture_mu=3.6, crystal_mu=0.404, photons_per_decay=0.891
+        mph.read_system(small_workbook), [[0, 0, 0]], aperture_mu=3.6, crystal_mu=0.404, photons_per_decay=0.891
     )
     assert [m["sensitivity"] for m in printed["modules"]] == pytest.approx(1e6 * expected[0])
     assert printed["total"]["sensitivity"] == pytest.approx(1e6 * expected.sum())
-    assert printed["total"]["modules_holding_roi"] == 80
+    assert printed["total"]["modules_holding_roi"] == 24
     assert all(m["roi_radius_seen"] == pytest.approx(75, abs=1e-3) for m in printed["modules"])
     named = ["--aperture-mu", "tungsten", "--crystal-mu", "CZT", "--isotope", "Tc-99m", "--json"]
-    assert main(["geometry", "performance", str(workbook), *named]) == 0
+    assert main(["geometry", "performance", str(small_workbook), *named]) == 0
     total = json.loads(capsys.readouterr().out)["total"]["sensitivity"]
     assert total == pytest.approx(1e6 * expected.sum(), rel=1e-3)
-    assert main(["geometry", "performance", str(workbook), *named[2:4]]) == 1
+    assert main(["geometry", "performance", str(small_workbook), *named[2:4]]) == 1
     assert "crystal_mu 'CZT': at which energy" in capsys.readouterr().err
-    assert main(["geometry", "performance", str(workbook), "--opening-angle", "200"]) == 1
+    assert main(["geometry", "performance", str(small_workbook), "--opening-angle", "200"]) == 1
     assert "--opening-angle: expected less than 180 degrees, got 200" in capsys.readouterr().err
-    assert main(["geometry", "performance", str(workbook), "--point", "0", "0", "900"]) == 0
-    assert "from 0 of 80 modules" in capsys.readouterr().out
+    assert main(["geometry", "performance", str(small_workbook), "--point", "0", "0", "900"]) == 0
+    assert "from 0 of 24 modules" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("quantity", ["sensitivity", "modules", "resolution", "completeness"])
-def test_geometry_map_writes_a_volume(workbook, tmp_path, capsys, quantity):
+def test_geometry_map_writes_a_volume(small_workbook, tmp_path, capsys, quantity):
     path = tmp_path / "new" / f"{quantity}.nii.gz"
     grid = ["--voxels", "6", "5", "4", "--spacing", "20", "--center", "10", "0", "0"]
-    assert main(["geometry", "map", str(workbook), "--quantity", quantity, *grid, "-o", str(path)]) == 0
+    assert main(["geometry", "map", str(small_workbook), "--quantity", quantity, *grid, "-o", str(path)]) == 0
     volume = mph.read_volume(path)
     assert volume.quantity == quantity
     assert volume.grid == mph.Grid.centered((6, 5, 4), 20.0, (10, 0, 0))
-    system = mph.read_system(workbook)
+    system = mph.read_system(small_workbook)
     make = {"sensitivity": mph.sensitivity_map, "modules": mph.modules_map, "resolution": mph.resolution_map}
     assert np.array_equal(volume.array, make.get(quantity, mph.completeness_map)(system, volume.grid).array)
     assert quantity in capsys.readouterr().out
     if quantity in ("modules", "completeness"):
         with_material = ["--quantity", quantity, "--crystal-mu", "CZT", "-o", str(path)]
-        assert main(["geometry", "map", str(workbook), *with_material]) == 1
+        assert main(["geometry", "map", str(small_workbook), *with_material]) == 1
         assert f"--crystal-mu has no effect on --quantity {quantity}" in capsys.readouterr().err
 
 
-def test_geometry_of_a_fit_is_generated_again(workbook, tmp_path, capsys):
+def test_geometry_of_a_fit_is_generated_again(small_workbook, tmp_path, capsys):
     """The workbook made from the printed parameters follows the same ellipse."""
-    assert main(["geometry", "fit", str(workbook), "--json"]) == 0
+    assert main(["geometry", "fit", str(small_workbook), "--json"]) == 0
     ring = json.loads(capsys.readouterr().out)["rings"][0]
     assert ring["curve_deviation"] < 0.001
     path = tmp_path / "again.xlsx"

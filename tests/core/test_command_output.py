@@ -15,7 +15,8 @@ import mphdrr.core as mph
 from mphdrr.addon.cli import COMMANDS, main
 from mphdrr.core.cli import build_parser
 
-from .conftest import WORKBOOK, refused, run_python
+from .conftest import FEWER_MODULES as WORKBOOK
+from .conftest import refused, run_python
 
 
 def parsers(

@@ -7,9 +7,9 @@ import pytest
 
 import mphdrr.core as mph
 
-from .conftest import WORKBOOK, refused
+from .conftest import dc_spect, refused
 
-SYSTEM = mph.read_system(WORKBOOK)[[0, 21, 47]]
+SYSTEM = dc_spect()[[0, 21, 47]]
 SYSTEM = SYSTEM.replace(tilt=0.02 * np.random.default_rng(1).normal(size=(3, 3)))
 GRID = mph.Grid.centered((9, 8, 7), 7.0, center=(4.0, -3.0, 2.0))
 SHAPE, PITCH, OFFSET = (15, 13), np.array([3.2, 3.4]), np.array([1.0, 2.0])

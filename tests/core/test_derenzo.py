@@ -11,8 +11,6 @@ import mphdrr.core as mph
 
 from .test_phantoms import total
 
-AS_SHIPPED = True  # voxels of all samples
-
 RODS = (8.0, 6.0, 5.0, 4.0, 3.0, 2.0)
 
 

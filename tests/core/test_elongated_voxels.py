@@ -12,8 +12,6 @@ from mphdrr.core.progress import Cancelled
 
 from .test_phantoms import KINDS, PAINTING, SHAPES, total
 
-AS_SHIPPED = True  # voxels of all samples
-
 trimesh = pytest.importorskip("trimesh")
 
 SHEAR = np.array([[1, 0.6, -0.4], [0, 1, 0.3], [0, 0, -1]])  # and mirror

@@ -8,7 +8,7 @@ import pytest
 import mphdrr.core as mph
 from mphdrr.core.physics.isotopes import photon_energy
 
-from .conftest import BACKENDS, WORKBOOK, emission, general_grid, refused
+from .conftest import BACKENDS, dc_spect, emission, general_grid, refused
 
 TOLERANCE = {"numpy": 1e-12, "torch": 1e-5, "cpu": 1e-5}
 
@@ -67,7 +67,7 @@ def test_point_source_obeys_pinhole_sensitivity(rng, step):
     A spot is 27 voxels with weights 1-2-1 along each axis (a single voxel's edges would beat with the pixels). The
     total counts of every voxel are the adjoint of an image of ones.
     """
-    system = mph.read_system(WORKBOOK)
+    system = dc_spect()
     grid = turned_grid((27, 27, 27), 6.0)
     places = np.c_[in_ball(rng, system.roi_radius.min() - 6, 100), np.ones(100)]
     steps = np.stack(np.meshgrid(*[[-1, 0, 1]] * 3, indexing="ij"), axis=-1).reshape(27, 3)
@@ -83,7 +83,7 @@ def test_point_source_obeys_pinhole_sensitivity(rng, step):
 
 
 def test_point_source_obeys_pinhole_sensitivity_to_a_thousandth_with_fine_pixels(rng):
-    system = mph.read_system(WORKBOOK)[::27]
+    system = dc_spect()[::27]
     for place in in_ball(rng, 60, 2):
         grid = turned_grid((1, 1, 1), 3.0, place)
         expected = sensitivity(system, place[None])[:, 0] * grid.voxel_volume

@@ -8,12 +8,19 @@ import pytest
 import mphdrr.core as mph
 from mphdrr.core.cli import main
 
+from .conftest import FEWER_MODULES
+
 POINT = [8.0, -13, 21]
 
 
+@pytest.fixture(scope="module")
+def scanner() -> mph.PinholeSystem:
+    return mph.read_system(FEWER_MODULES)
+
+
 @pytest.fixture
-def run(workbook, capsys):
-    def of(*words, book=workbook, status=0):
+def run(capsys):
+    def of(*words, book=FEWER_MODULES, status=0):
         assert main(["geometry", "epipolar", str(book), *map(str, words)]) == status
         out, err = capsys.readouterr()
         errors = [line for line in err.splitlines() if not line.startswith("mphdrr: warning: three.xlsx")]
@@ -77,7 +84,7 @@ def test_an_epipole_in_the_image_is_listed(run, tmp_path):
 
 
 def test_a_point_is_found_from_its_pixels(run, scanner, pixels):
-    modules = [3, 19, 61]
+    modules = [3, 11, 21]
     text = run(*pixel_options(scanner, pixels, *modules))
     assert text.startswith("point x 8.000 +- ") and text.rstrip().endswith("they fit together")
     answer = run(*pixel_options(scanner, pixels, *modules), "--sigma", 0.5, "--json")
@@ -90,15 +97,15 @@ def test_a_point_is_found_from_its_pixels(run, scanner, pixels):
 
 
 def test_the_module_that_does_not_fit_is_named(run, scanner, pixels):
-    pixels[33] += [5, 4]
-    words = pixel_options(scanner, pixels, 3, 19, 33, 61, 70)
-    assert f"module {scanner.numbers[33]} does not fit" in run(*words)
+    pixels[8] += [5, 4]
+    words = pixel_options(scanner, pixels, 3, 19, 8, 13, 22)
+    assert f"module {scanner.numbers[8]} does not fit" in run(*words)
     answer = run(*words, "--json")
-    assert answer["misfitting"] == scanner.numbers[33]
-    assert max(answer["modules"], key=lambda row: row["misfit"])["number"] == scanner.numbers[33]
-    two = run(*pixel_options(scanner, pixels, 33, 61), "--sigma", 0.1)
+    assert answer["misfitting"] == scanner.numbers[8]
+    assert max(answer["modules"], key=lambda row: row["misfit"])["number"] == scanner.numbers[8]
+    two = run(*pixel_options(scanner, pixels, 8, 13), "--sigma", 0.1)
     assert "nothing says which is wrong" in two and two.count(" -\n") == 2
-    assert run(*pixel_options(scanner, pixels, 33, 61), "--json")["modules"][0]["misfit"] is None
+    assert run(*pixel_options(scanner, pixels, 8, 13), "--json")["modules"][0]["misfit"] is None
 
 
 @pytest.mark.parametrize(
@@ -106,7 +113,7 @@ def test_the_module_that_does_not_fit_is_named(run, scanner, pixels):
     [
         ("--pixel 7:3", "MODULE:COLUMN,ROW"),
         ("--pixel 7,3,4", "MODULE:COLUMN,ROW"),
-        ("--pixel 99:3,4", "no module 99; there are 1 to 80"),
+        ("--pixel 99:3,4", "no module 99; there are 1 to 24"),
         ("--pixel 7:nan,4", "--pixel '7:nan,4': expected"),
         ("--pixel 7:3,4 --pixel 7:3,5", "several of module 7"),
         ("--pixel 7:3,4 --pixel 8:3,5 --sigma 0", "sigma"),

@@ -14,8 +14,6 @@ from .conftest import refused
 from .small_events import TEXT, WORKBOOK, small_recipe
 from .test_event_work import tree
 
-AS_SHIPPED = True  # other processes make the same
-
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory) -> Path:

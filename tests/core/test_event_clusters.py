@@ -15,8 +15,6 @@ from mphdrr.core import events
 from .small_events import small_recipe
 from .test_event_work import begin, tree
 
-AS_SHIPPED = True  # other processes make the same
-
 COUNT = 8
 pytestmark = pytest.mark.long
 

@@ -44,7 +44,7 @@ def stored(event: events.Event) -> dict[str, np.ndarray]:
 
 def test_the_images_are_of_the_truth_in_the_file(small):
     """Everything is computed anew from what h5py reads: the truth, its affine, the matrices of the views."""
-    views = mph.read_system(WORKBOOK)[[0, 1, 2, 3, 20, 21, 22, 23]].views((14, 16))
+    views = mph.read_system(WORKBOOK).views((14, 16))
     for event in small:
         found = stored(event)
         truth, affine = found["truth"], found["truth_affine"]

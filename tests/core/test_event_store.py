@@ -28,8 +28,6 @@ from .conftest import refused
 from .small_events import TEXT, small_recipe
 from .test_event_work import tree
 
-AS_SHIPPED = True  # other processes make the same
-
 h5py = pytest.importorskip("h5py")
 COUNT = 6
 

@@ -14,8 +14,6 @@ from .conftest import refused
 torch = pytest.importorskip("torch", reason="no torch")
 from torch.utils.data import DataLoader, Dataset  # noqa: E402
 
-AS_SHIPPED = True  # other processes make the same
-
 
 def same(first: dict, second: dict) -> bool:
     return first.keys() == second.keys() and all(torch.equal(first[name], second[name]) for name in first)

@@ -21,8 +21,6 @@ from .conftest import WORKBOOK, refused, refused_command
 from .small_events import TEXT, small_recipe
 from .small_events import WORKBOOK as SMALL_WORKBOOK
 
-AS_SHIPPED = True  # other processes make the same
-
 COUNT = 6
 
 

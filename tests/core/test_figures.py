@@ -18,7 +18,7 @@ from mphdrr.core.figures.sums import orthogonal_sum
 from mphdrr.core.runs import letters
 from mphdrr.core.runs.display import resize_picture
 
-from .conftest import WORKBOOK, refused, run_python
+from .conftest import FEWER_MODULES, dc_spect, refused, run_python
 
 TEXT = re.compile(
     r'<text x="([\d.-]+)" y="([\d.-]+)" font-size="([\d.]+)" fill="[^"]+" text-anchor="(\w+)"( transform="[^"]+")?>([^<]*)<'
@@ -28,7 +28,7 @@ DRAWN = [kind for kind in KINDS.values() if kind.draw is not None]
 
 @pytest.fixture(scope="module")
 def subject() -> FigureSubject:
-    system = mph.read_system(WORKBOOK)[::5]
+    system = dc_spect()[::5]
     pose = mph.euler_pose(np.radians(30), np.radians(55), np.radians(-10), (10.0, 0.0, -5.5))
     volume = mph.DerenzoPhantom(40, (8, 6, 5, 4, 3, 2), 40, 100).voxelize(mph.Grid.centered(40, 2.6), pose)
     views = system.views(shape=(16, 24))
@@ -175,11 +175,11 @@ def test_the_command_lists_and_draws_phantoms_runs_and_volumes(subject, tmp_path
         (["sums", "derenzo"], "nothing to write: give --output FILE"),
         (["sums", "derenzo", "-o", "a.jpg"], "a.jpg: expected a name ending in .png, .svg"),
         (["sums", "derenzo", "-o", "a.png", "--size", "10x900"], "size 10x900: expected 120 to 16384 pixels"),
-        (["sums", WORKBOOK, "-o", "a.png"], "figure sums: needs a volume: give a volume file, a phantom, a run or a .blend"),
-        (["mosaic", WORKBOOK, "-o", "a.png"], "figure mosaic: needs projections"),
-        (["c-arm", WORKBOOK, "--modules", "90", "-o", "a.png"], "--modules '90': no module 90; there are 1 to 80"),
-        (["c-arm", WORKBOOK, "--position", "1", "2", "3", "-o", "a.png"], "--position is for a phantom"),
-        (["scanner", "a.blend", WORKBOOK, "-o", "a.png"], "a.blend: a .blend holds all that is shown"),
+        (["sums", FEWER_MODULES, "-o", "a.png"], "figure sums: needs a volume: give a volume file, a phantom"),
+        (["mosaic", FEWER_MODULES, "-o", "a.png"], "figure mosaic: needs projections"),
+        (["c-arm", FEWER_MODULES, "--modules", "90", "-o", "a.png"], "--modules '90': no module 90; there are 1 to 24"),
+        (["c-arm", FEWER_MODULES, "--position", "1", "2", "3", "-o", "a.png"], "--position is for a phantom"),
+        (["scanner", "a.blend", FEWER_MODULES, "-o", "a.png"], "a.blend: a .blend holds all that is shown"),
     ],
 )  # fmt: skip
 def test_the_command_refuses_in_one_line(tmp_path, monkeypatch, capsys, words, message):
@@ -193,7 +193,7 @@ def test_the_command_refuses_in_one_line(tmp_path, monkeypatch, capsys, words, m
 def test_figures_that_are_drawn_need_no_blender(tmp_path):
     run = run_python(
         "import sys; sys.modules['bpy'] = None; from mphdrr.addon.cli import main; "
-        f"out = {str(tmp_path / 'a.png')!r}; book = {str(WORKBOOK)!r}; "
+        f"out = {str(tmp_path / 'a.png')!r}; book = {str(FEWER_MODULES)!r}; "
         "sys.exit(10 * main(['figure', 'c-arm', book, '-o', out]) + main(['figure', 'scanner', book, '-o', out]))"
     )
     assert run.returncode == 1, run.stderr

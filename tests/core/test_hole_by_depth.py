@@ -10,14 +10,14 @@ import pytest
 
 import mphdrr.core as mph
 
-from .conftest import WORKBOOK, general_grid, refused, voxel_centers
+from .conftest import dc_spect, general_grid, refused, voxel_centers
 from .test_batch_axes import check_batch
 from .test_emission import assert_adjoint, assert_real_is_virtual, one_module, sensitivity
 from .test_projector import rotation
 from .test_volume_formats import CHEST
 from .traced_photons import misplaced
 
-SYSTEM = mph.read_system(WORKBOOK)[[0, 47]]
+SYSTEM = dc_spect()[[0, 47]]
 
 
 def depth_projector(grid, pixels=64, backend="auto", system=SYSTEM, **changes):
@@ -74,7 +74,7 @@ def errors_of_voxels(rng, size, pixels, hole, near=False, voxels=1, depth=80, wo
 
     The grid is 50 mm wide, or `depth` voxels. With `near`, it is as close to the pinhole as "depth" takes it.
     """
-    system = mph.read_system(WORKBOOK)[[int(rng.integers(80))]]
+    system = dc_spect()[[int(rng.integers(80))]]
     system = dataclasses.replace(system, pinhole_diameter=hole)
     n = 2 * round(min(25 / size, depth / 2)) + 1
     turn = rotation(rng) if rng.random() < 0.6 else np.eye(3)

@@ -19,7 +19,6 @@ from mphdrr.core.version import VERSION
 
 pytestmark = pytest.mark.long
 
-AS_SHIPPED = True  # other processes make the same
 
 ROOT = Path(__file__).parents[2]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))

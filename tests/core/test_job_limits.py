@@ -26,10 +26,11 @@ MIB = 2**20
 def job(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     """Yield a folder that stands for /sys/fs/cgroup, with /proc/self beside it; `groups` says where a process is."""
     monkeypatch.setattr(memory, "_PROCESS", tmp_path / "proc")
-    monkeypatch.setattr(memory, "available", memory.available.__wrapped__)  # type: ignore[attr-defined]
-    memory._control_groups.cache_clear()
+    for kept in (memory._control_groups, memory._limit_files):
+        kept.cache_clear()
     yield tmp_path / "sys"
-    memory._control_groups.cache_clear()
+    for kept in (memory._control_groups, memory._limit_files):
+        kept.cache_clear()
 
 
 def groups(job: Path, cgroup: str, mounts: str) -> None:

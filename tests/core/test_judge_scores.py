@@ -15,8 +15,6 @@ from mphdrr.core.learning.judging.scoring import SCORINGS, Case
 from mphdrr.core.learning.judging.summary import compare_scores, mean_scores, row_notes
 from mphdrr.core.phantoms import painting
 
-AS_SHIPPED = True  # voxels of all samples
-
 
 @pytest.mark.parametrize("mean", [0.003, 0.1, 1.0, 7.0, 49.0, 51.0, 400.0])
 def test_true_means_have_a_deviance_of_1_at_any_counts(mean):

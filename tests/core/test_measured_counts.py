@@ -325,17 +325,17 @@ def test_dicom_says_its_time_and_what_else_it_holds(system, tmp_path):
     refused(lambda: mph.read_counts(path), "modality CT: expected nuclear medicine")
 
 
-def test_the_command_takes_counts_for_projections(workbook, tmp_path, capsys):
+def test_the_command_takes_counts_for_projections(small_workbook, tmp_path, capsys):
     counts = np.random.default_rng(3).poisson(4.0, (4, 8, 8))
     np.save(tmp_path / "c.npy", counts)
     run, picture = tmp_path / "run.h5", tmp_path / "m.png"
-    command = ["project", str(workbook), "--modules", "1-4", "--counts", str(tmp_path / "c.npy")]
+    command = ["project", str(small_workbook), "--modules", "1-4", "--counts", str(tmp_path / "c.npy")]
     told = ["--frames", "4-1", "--orientation", "back-v", "--time", "60", "--isotope", "Tc-99m"]
     assert main([*command, *told, "-o", str(run), "--mosaic", str(picture)]) == 0
     made = mph.read_run(run)
     np.testing.assert_array_equal(made.projections, counts[::-1])
     assert picture.read_bytes().startswith(b"\x89PNG")
-    assert (made.workbook, made.settings["frames"]) == (workbook.name, [4, 3, 2, 1])
+    assert (made.workbook, made.settings["frames"]) == (small_workbook.name, [4, 3, 2, 1])
     assert module_labels(made) == ["1 (4)", "2 (3)", "3 (2)", "4 (1)"]
     assert counts_caption(made).startswith("c.npy, 60 s, frames back-v. Module (frame): crystals seen from behind")
     assert main([*command, *told, "--write-recipe", str(tmp_path / "c.toml")]) == 0

@@ -10,8 +10,6 @@ from mphdrr.core.volumes.meshes.mesh import MESH_FORMATS
 
 from .conftest import general_grid
 
-AS_SHIPPED = True  # voxels of all samples
-
 trimesh = pytest.importorskip("trimesh")
 
 

@@ -10,8 +10,6 @@ import mphdrr.core as mph
 
 from .conftest import refused
 
-AS_SHIPPED = True  # voxels of all samples
-
 BODY = mph.NemaBody()
 GRID = mph.Grid.centered((158, 122, 21), (2.0, 2.0, 2.0))
 

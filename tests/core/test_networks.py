@@ -17,7 +17,7 @@ from mphdrr.core.learning.networks.network import UNet, normalized_backprojectio
 from mphdrr.core.learning.networks.parallel import parallel_beam  # noqa: E402
 from mphdrr.core.learning.setup import Sample, ScannerSetup  # noqa: E402
 
-from .conftest import WORKBOOK  # noqa: E402
+from .conftest import dc_spect  # noqa: E402
 
 SMALL: dict[str, dict[str, Any]] = {
     "after-osem": {"channels": (4, 4, 4)},
@@ -42,7 +42,7 @@ def one_thread():
 @cache
 def setup_of(every: int = 16, permuted: int | None = None, backend: str = "auto", **model: Any) -> ScannerSetup:
     """Return the setup of every n-th module; `model` are settings of its `Emission`."""
-    system = mph.read_system(WORKBOOK)[::every]
+    system = dc_spect()[::every]
     views = system.views(shape=(8, 8), detector="real")
     return ScannerSetup(
         mph.Projector(GRID, views, mph.Emission(system, time=60.0, **model), backend, threads=1), 2, (1, 2, 3), permuted

@@ -6,7 +6,7 @@ import pytest
 import mphdrr.core as mph
 from mphdrr.core.reconstruction.snapshots import Snapshots
 
-from .conftest import WORKBOOK
+from .conftest import dc_spect
 
 torch = pytest.importorskip("torch", reason="torch is not installed")
 
@@ -19,7 +19,7 @@ SLOPE, LEVEL = np.array([0.3, -0.2, 0.5]), 40.0  # of a volume that is linear in
 def views(kind: str) -> mph.Views:
     if kind == "parallel":
         return mph.parallel_views(np.array([0.3, 1.2]), (12, 14), 9.0)
-    return mph.read_system(WORKBOOK)[[3, 40, 71]].views((12, 14), "real")
+    return dc_spect()[[3, 40, 71]].views((12, 14), "real")
 
 
 @pytest.mark.parametrize("kind", ["pinholes", "parallel"])
@@ -51,7 +51,7 @@ def test_gradients_pass_the_maps():
 
 @pytest.mark.parametrize("subsets", [1, 3])
 def test_snapshots_are_the_volumes_of_osem(subsets):
-    system = mph.read_system(WORKBOOK)[::10]
+    system = dc_spect()[::10]
     grid = mph.Grid.centered((10, 10, 10), 9.0)
     A = mph.Projector(grid, system.views((12, 12), "real"), mph.Emission(system, hole="point", time=600.0))
     truth = mph.DerenzoPhantom(35, (20, 18, 16, 14, 12, 10), 40, activity=80.0).voxelize(grid).array

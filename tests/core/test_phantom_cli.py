@@ -82,11 +82,11 @@ def test_random_instances_are_written_with_their_poses(tmp_path, capsys):
         assert entry["total_kBq"] == pytest.approx(phantom.total_activity, rel=1e-3)
 
 
-def test_a_phantom_of_shapes_is_projected(workbook, tmp_path, capsys):
+def test_a_phantom_of_shapes_is_projected(small_workbook, tmp_path, capsys):
     path = tmp_path / "thorax.toml"
     path.write_text(THORAX)
     options = ["--voxels", "40", "--size", "12", "12", "--modules", "1-2"]
-    words = ["project", str(workbook), "--phantom", str(path), *options]
+    words = ["project", str(small_workbook), "--phantom", str(path), *options]
     assert main([*words, "-o", str(tmp_path / "run.npz")]) == 0
     run = mph.read_run(tmp_path / "run.npz")
     assert run.settings["volume"] == "thorax.toml" and run.recipe["phantom.file"] == str(path)
@@ -98,7 +98,7 @@ def test_a_phantom_of_shapes_is_projected(workbook, tmp_path, capsys):
 
 @pytest.mark.long
 @pytest.mark.parametrize("is_file", [True, False], ids=["file", "Derenzo"])
-def test_a_phantoms_own_mu_attenuates_as_its_volume_would(is_file, workbook, tmp_path, capsys):
+def test_a_phantoms_own_mu_attenuates_as_its_volume_would(is_file, small_workbook, tmp_path, capsys):
     (tmp_path / "thorax.toml").write_text(THORAX)
     place = ["--voxels", "22", "21", "22", "--spacing", "7.5", "--euler", "10", "20", "30", "--position", "3", "2", "1"]
     water = ["--rods", "9", "9", "8", "8", "9", "9", "--water", "45", "50", "--background", "20"]
@@ -106,7 +106,7 @@ def test_a_phantoms_own_mu_attenuates_as_its_volume_would(is_file, workbook, tmp
     for quantity in ("activity", "mu"):
         words = ["phantom", *make, "--quantity", quantity, "-o", str(tmp_path / f"{quantity}.npz")]
         assert main(words) == 0
-    project = ["project", str(workbook), *NUMPY, "--modules", "1", "--emission", "--isotope", "Tc-99m"]
+    project = ["project", str(small_workbook), *NUMPY, "--modules", "1", "--emission", "--isotope", "Tc-99m"]
     files = ["--volume", str(tmp_path / "activity.npz"), "--mu", str(tmp_path / "mu.npz")]
     source = ["--phantom", str(tmp_path / "thorax.toml"), *place] if is_file else [*water, *place]
     counts = []
@@ -119,8 +119,8 @@ def test_a_phantoms_own_mu_attenuates_as_its_volume_would(is_file, workbook, tmp
     assert mph.read_run(tmp_path / "own.npz").recipe["attenuation.of_phantom"]
 
 
-def test_a_phantoms_own_mu_is_checked(workbook, tmp_path, capsys):
-    words = ["project", str(workbook), *NUMPY, "--modules", "1", "--voxels", "16", "--emission"]
+def test_a_phantoms_own_mu_is_checked(small_workbook, tmp_path, capsys):
+    words = ["project", str(small_workbook), *NUMPY, "--modules", "1", "--voxels", "16", "--emission"]
     out = str(tmp_path / "run.npz")
     assert main([*words, "--phantom-mu", "--isotope", "Tl-201", "-o", out]) == 0
     assert (
@@ -132,7 +132,7 @@ def test_a_phantoms_own_mu_is_checked(workbook, tmp_path, capsys):
     assert main([*words, "--phantom-mu", "--mu", "mu.npz", "-o", out]) == 1
 
 
-def test_a_beating_heart_is_a_run_for_each_state(workbook, tmp_path, capsys, monkeypatch):
+def test_a_beating_heart_is_a_run_for_each_state(small_workbook, tmp_path, capsys, monkeypatch):
     def quick(torso, grid, pose, *_, **__):
         np.testing.assert_allclose(pose[:3, 3], (9, 8, 7))
         return mph.Volume(np.full(grid.shape, 1 + torso.phase), grid)
@@ -145,7 +145,7 @@ def test_a_beating_heart_is_a_run_for_each_state(workbook, tmp_path, capsys, mon
     assert [state.array.max() for state in states] == [1, 1.5] and states[0].grid == states[1].grid
 
     files = [str(tmp_path / f"beat-{k}.npz") for k in (1, 2)]
-    project = ["project", str(workbook), *NUMPY, "--modules", "30", "--emission", "--hole", "point", "--center"]
+    project = ["project", str(small_workbook), *NUMPY, "--modules", "20", "--emission", "--hole", "point", "--center"]
     more = ["--noise", "5", "--mosaic", str(tmp_path / "m.png")]
     assert main([*project, "--states", *files, *more, "-o", str(tmp_path / "run.npz")]) == 0
     for k, file in enumerate(files):

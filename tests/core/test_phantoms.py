@@ -13,8 +13,6 @@ from mphdrr.core.phantoms import kinds
 
 from .conftest import WORKBOOK, general_grid
 
-AS_SHIPPED = True  # voxels of all samples
-
 EXAMPLES = WORKBOOK.parent / "phantoms"
 CUT = [(1, 0.3, 0.2, 1.5), (0, -1, 0.5, 2)]
 SHAPES = [

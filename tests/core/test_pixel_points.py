@@ -11,10 +11,10 @@ import mphdrr.core as mph
 from mphdrr.core.errors import InputWarning
 from mphdrr.core.models.pixel_points import expected_error, lattice, offsets, points_needed, shadow_edges
 
-from .conftest import WORKBOOK, refused
+from .conftest import dc_spect, refused
 from .test_emission import in_ball, one_module, turned_grid
 
-MODULES = mph.read_system(WORKBOOK)[[3, 10, 21, 38, 62]]  # of all rings; two look nearly along an axis
+MODULES = dc_spect()[[3, 10, 21, 38, 62]]  # of all rings; two look nearly along an axis
 
 
 def law(system, grid):

@@ -9,7 +9,6 @@ import warnings
 import numpy as np
 import pytest
 
-import mphdrr.core as mph
 import mphdrr.core.memory
 from mphdrr.core.errors import InputWarning
 from mphdrr.core.geometry.grid import Grid
@@ -19,7 +18,7 @@ from mphdrr.core.rays import backends
 from mphdrr.core.rays.backends import cpu
 from mphdrr.core.volumes.volume import Volume
 
-from .conftest import WORKBOOK, emission, refused, run_python
+from .conftest import dc_spect, emission, refused, run_python
 
 GRID = Grid.centered((5, 4, 3), 1.0)
 VIEWS = Views(
@@ -196,7 +195,7 @@ def test_progress_comes_as_often_however_many_rays_a_pixel_has(pixel_points, mon
 
 
 def test_images_do_not_depend_on_threads_where_they_are_attenuated():
-    system = mph.read_system(WORKBOOK)[::10]
+    system = dc_spect()[::10]
     mu = Volume(np.random.default_rng(0).random(GRID.shape) * 0.6, GRID, "mu")
     first, second = (
         Projector(GRID, system.views((72, 72)), emission(system, mu), threads=threads)(ONES) for threads in (1, 6)

@@ -144,18 +144,18 @@ def _said_nothing(volume: mph.Volume, path) -> None:
     nibabel.save(nibabel.Nifti1Image(volume.array, volume.grid.affine), path)
 
 
-def _project(workbook, folder, *options) -> int:
-    return main(["project", str(workbook), *SMALL, *map(str, options), "-o", str(folder / "run.h5")])
+def _project(small_workbook, folder, *options) -> int:
+    return main(["project", str(small_workbook), *SMALL, *map(str, options), "-o", str(folder / "run.h5")])
 
 
 @pytest.mark.parametrize(("option", "labelled"), [("--volume", False), ("--states", True)])
-def test_ct_numbers_are_no_radiograph_but_converted_they_are(option, labelled, ct, workbook, tmp_path, capsys):
+def test_ct_numbers_are_no_radiograph_but_converted_they_are(option, labelled, ct, small_workbook, tmp_path, capsys):
     path = tmp_path / "ct.nii.gz"
     (write_volume if labelled else _said_nothing)(ct, path)
-    assert _project(workbook, tmp_path, option, path) == 1
+    assert _project(small_workbook, tmp_path, option, path) == 1
     said = capsys.readouterr().err
     assert "give --energy KEV to convert" in said and said.count("\n") == 1 and not list(tmp_path.glob("run*"))
-    assert _project(workbook, tmp_path, option, path, "--energy", "60") == 0
+    assert _project(small_workbook, tmp_path, option, path, "--energy", "60") == 0
     run = mph.read_run(tmp_path / "run.h5")
     mu = mph.hu_to_mu(ct, 60.0)
     np.testing.assert_allclose(run.volume.array, mu.array, rtol=1e-6)
@@ -167,9 +167,9 @@ def test_ct_numbers_are_no_radiograph_but_converted_they_are(option, labelled, c
     ("quantity", "options", "unit"),
     [("activity", [], "kBq/mL mm"), ("mu", [], "1/mm mm"), ("activity", ["--emission"], "counts")],
 )
-def test_a_file_that_says_nothing_holds_what_the_user_says(quantity, options, unit, workbook, tmp_path):
+def test_a_file_that_says_nothing_holds_what_the_user_says(quantity, options, unit, small_workbook, tmp_path):
     _said_nothing(volume_of(quantity), tmp_path / "a.nii")
-    assert _project(workbook, tmp_path, "--volume", tmp_path / "a.nii", "--quantity", quantity, *options) == 0
+    assert _project(small_workbook, tmp_path, "--volume", tmp_path / "a.nii", "--quantity", quantity, *options) == 0
     run = mph.read_run(tmp_path / "run.h5")
     assert (run.volume.quantity, run.unit) == (quantity, unit)
 
@@ -192,30 +192,30 @@ def test_a_file_that_says_nothing_holds_what_the_user_says(quantity, options, un
     ],
 )
 def test_what_the_model_cannot_mean_is_refused_in_one_line(
-    options, message, ct, workbook, tmp_path, capsys, monkeypatch
+    options, message, ct, small_workbook, tmp_path, capsys, monkeypatch
 ):
     _said_nothing(ct, tmp_path / "ct.nii")
     _said_nothing(mph.Volume(ct.array + 1000 + 2960 * (ct.array > 0), GRID), tmp_path / "raw.nii")
     _said_nothing(volume_of("mu"), tmp_path / "mu.nii")
     write_volume(volume_of("sensitivity"), tmp_path / "map.npz")
     monkeypatch.chdir(tmp_path)
-    assert _project(workbook, tmp_path, *options) == 1
+    assert _project(small_workbook, tmp_path, *options) == 1
     said = capsys.readouterr().err
     assert re.search(message, said) and said.count("\n") == 1 and not (tmp_path / "run.h5").exists()
 
 
-def test_activity_below_0_is_taken_where_it_is_said_to_be_activity(workbook, tmp_path, ct, capsys):
+def test_activity_below_0_is_taken_where_it_is_said_to_be_activity(small_workbook, tmp_path, ct, capsys):
     _said_nothing(ct, tmp_path / "ct.nii")
     options = ["--volume", tmp_path / "ct.nii", "--emission", "--quantity", "activity"]
-    assert _project(workbook, tmp_path, *options) == 0
+    assert _project(small_workbook, tmp_path, *options) == 0
     assert "what is below 0 makes counts below 0" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(("energy", "said"), [("I-131", False), ("Tc-99m", True)])
-def test_attenuation_at_another_energy_than_the_photons_is_said(energy, said, ct, workbook, tmp_path, capsys):
+def test_attenuation_at_another_energy_than_the_photons_is_said(energy, said, ct, small_workbook, tmp_path, capsys):
     write_volume(ct, tmp_path / "ct.npz")
     write_volume(volume_of("activity"), tmp_path / "a.npz")
     options = ["--volume", tmp_path / "a.npz", "--emission", "--isotope", "I-131", "--mu", tmp_path / "ct.npz"]
-    assert _project(workbook, tmp_path, *options, "--energy", energy) == 0
+    assert _project(small_workbook, tmp_path, *options, "--energy", energy) == 0
     expected = "the mu of ct.npz holds at 140.5 keV, photons of 328.05 to 400.95 keV are counted"
     assert (expected in capsys.readouterr().err) == said

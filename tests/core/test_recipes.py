@@ -18,8 +18,6 @@ from mphdrr.core.runs.settings import SETTINGS
 
 from .conftest import refused, refused_command
 
-AS_SHIPPED = True  # compared with voxels of every Python
-
 DATA = Path(__file__).parent / "data"
 SMALL = ["--voxels", "12", "--spacing", "8", "--size", "6", "8", "--modules", "3-4"]
 COUNTS = ["--emission", "--isotope", "Tc-99m", "--aperture-mu", "tungsten", "--pixel-points", "3", "--tolerance", "9"]
@@ -69,11 +67,11 @@ def test_what_is_wrong_in_a_file_is_named_by_file_and_key(text, said, tmp_path):
     assert "r.toml" in str(error.value) and "\n" not in str(error.value)
 
 
-def test_options_their_recipe_and_its_run_make_the_same_images(workbook, tmp_path, capsys):
+def test_options_their_recipe_and_its_run_make_the_same_images(small_workbook, tmp_path, capsys):
     options = [*SMALL, *COUNTS, "--euler", "10", "20", "30", "--position", "1", "2", "3", "--noise", "4"]
     toml, first, second, third = (str(tmp_path / name) for name in ("r.toml", "a.h5", "b.npz", "c.h5"))
-    assert main(["project", str(workbook), *options, "-o", first]) == 0
-    assert main(["project", str(workbook), *options, "--write-recipe", toml]) == 0
+    assert main(["project", str(small_workbook), *options, "-o", first]) == 0
+    assert main(["project", str(small_workbook), *options, "--write-recipe", toml]) == 0
     assert main(["project", toml, "-o", second]) == 0
     assert main(["project", second, "-o", third]) == 0
     runs = [mph.read_run(path) for path in (first, second, third)]
@@ -108,7 +106,7 @@ def test_a_changed_recipe_keeps_what_still_holds_and_no_more():
 
 
 @pytest.mark.parametrize("centered", [False, True])
-def test_a_run_made_again_is_attenuated_again(centered, workbook, tmp_path, capsys):
+def test_a_run_made_again_is_attenuated_again(centered, small_workbook, tmp_path, capsys):
     """Also where the attenuation is the phantom's, or is moved with the volume."""
     first, second = str(tmp_path / "a.h5"), str(tmp_path / "b.h5")
     options = ["--water", "45", "60", "--phantom-mu"]
@@ -118,7 +116,7 @@ def test_a_run_made_again_is_attenuated_again(centered, workbook, tmp_path, caps
             mph.write_volume(mph.Volume(np.full(away.shape, value), away, quantity), tmp_path / f"{name}.npz")
         options = ["--volume", str(tmp_path / "v.npz"), "--mu", str(tmp_path / "mu.npz"), "--center"]
     small = SMALL[4:] if centered else SMALL
-    assert main(["project", str(workbook), *small, "--emission", *options, "-o", first]) == 0
+    assert main(["project", str(small_workbook), *small, "--emission", *options, "-o", first]) == 0
     assert main(["project", first, "-o", second]) == 0
     runs = [mph.read_run(path) for path in (first, second)]
     assert runs[0].projections.max() > 0
@@ -129,11 +127,11 @@ def test_a_run_made_again_is_attenuated_again(centered, workbook, tmp_path, caps
 
 @pytest.mark.long
 @pytest.mark.parametrize("kind", KINDS, ids=lambda kind: kind.name)
-def test_a_phantom_has_settings_apart_from_those_of_its_grid(kind, workbook, tmp_path, capsys):
+def test_a_phantom_has_settings_apart_from_those_of_its_grid(kind, small_workbook, tmp_path, capsys):
     """Defrise's disks and the grid of points have a spacing, as the voxels have."""
     first, second = str(tmp_path / "a.h5"), str(tmp_path / "b.h5")
     small = ["--voxels", "14", "--spacing", "30", "31", "32", "--size", "6", "8", "--modules", "3"]
-    assert main(["project", str(workbook), "--phantom", kind.name, *small, "-o", first]) == 0
+    assert main(["project", str(small_workbook), "--phantom", kind.name, *small, "-o", first]) == 0
     assert main(["project", first, "-o", second]) == 0
     runs = [mph.read_run(path) for path in (first, second)]
     expected = kind.phantom(**kind.usual).voxelize(runs[0].volume.grid)
@@ -143,26 +141,27 @@ def test_a_phantom_has_settings_apart_from_those_of_its_grid(kind, workbook, tmp
         assert run.recipe == runs[0].recipe and run.recipe["phantom.spacing"] == (30, 31, 32)
 
 
-def test_every_entry_can_be_set_on_the_command_line(workbook, tmp_path, capsys, command):
+def test_every_entry_can_be_set_on_the_command_line(small_workbook, tmp_path, capsys, command):
     entries = ["model.kind=emission", "model.edge=path", "model.aperture_mu=2.5", "model.window=[60, 80]",
                "model.isotope=Tl-201", "phantom.kind=points", "phantom.counts=[2, 1, 1]"]  # fmt: skip
     words = [word for entry in entries for word in ("--set", entry)]
-    assert main(["project", str(workbook), *words, "--write-recipe", str(tmp_path / "r.toml")]) == 0
+    assert main(["project", str(small_workbook), *words, "--write-recipe", str(tmp_path / "r.toml")]) == 0
     recipe = mph.read_recipe(tmp_path / "r.toml")
     assert (recipe["model.aperture_mu"], recipe["model.window"], recipe["phantom.counts"]) == (2.5, (60, 80), (2, 1, 1))
     command("project", tmp_path / "r.toml", "--set", "model.window=", "--write-recipe", tmp_path / "s.toml")
     assert "model.window" not in mph.read_recipe(tmp_path / "s.toml").given
     for wrong, said in (("a=1", "expected TABLE.NAME"), ("model.kind", "expected KEY=VALUE"), ("model.x=1", "no such")):
-        words = ["project", workbook, "--set", wrong, "--write-recipe", tmp_path / "t.toml"]
+        words = ["project", small_workbook, "--set", wrong, "--write-recipe", tmp_path / "t.toml"]
         assert said in refused_command(capsys, *words)
 
 
-def test_runs_of_states_draw_their_own_noise(tmp_path, workbook):
+def test_runs_of_states_draw_their_own_noise(tmp_path, small_workbook):
     for number in (1, 2):
         volume = mph.Volume(np.full((4, 4, 4), number), mph.Grid.centered(4, 9.0), "activity")
         mph.write_volume(volume, tmp_path / f"{number}.npz")
     recipe = Recipe({
-        "system.file": str(workbook), "system.modules": "1", "volume.states": [str(tmp_path / f"{n}.npz") for n in (1, 2)],
+        "system.file": str(small_workbook), "system.modules": "1",
+        "volume.states": [str(tmp_path / f"{number}.npz") for number in (1, 2)],
         "model.kind": "emission", "detector.rows": 4, "detector.columns": 4, "noise.seed": 7,
     })  # fmt: skip
     runs = list(mph.run_recipe(recipe))
@@ -226,9 +225,9 @@ def test_a_workbook_of_version_0_1_0_opens(workbook):
         ({"volume.object": "CT mu"}, "'CT mu' is in a Blender scene; give --volume FILE"),
     ],
 )
-def test_what_only_a_scene_has_is_not_left_out(entries, said, workbook):
+def test_what_only_a_scene_has_is_not_left_out(entries, said, small_workbook):
     with pytest.raises(mph.InputError, match=said):
-        next(mph.run_recipe(Recipe({"system.file": str(workbook), "system.modules": "1", **entries})))
+        next(mph.run_recipe(Recipe({"system.file": str(small_workbook), "system.modules": "1", **entries})))
 
 
 def test_every_argument_of_a_model_is_a_setting():

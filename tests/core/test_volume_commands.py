@@ -93,8 +93,8 @@ def test_meshes_in_and_out(tmp_path, ct, capsys):
     assert "--value: expected one number, or one for each of 2 meshes" in capsys.readouterr().err
 
 
-def test_project_converts_and_centers_a_ct(tmp_path, ct, workbook, scanner, capsys, monkeypatch):
-    common = ("project", workbook, "--modules", "1", "--size", 9, 9, "--backend", "numpy")
+def test_project_converts_and_centers_a_ct(tmp_path, ct, small_workbook, scanner, capsys, monkeypatch):
+    common = ("project", small_workbook, "--modules", "1", "--size", 9, 9, "--backend", "numpy")
     ct_file, out = tmp_path / "ct.nrrd", tmp_path / "run.h5"
     assert run(*common, "--volume", ct_file, "--center", "--energy", "Tc-99m", "-o", out) == 0
     assert capsys.readouterr().err == ""
@@ -129,14 +129,14 @@ def test_project_converts_and_centers_a_ct(tmp_path, ct, workbook, scanner, caps
         assert message in capsys.readouterr().err
 
 
-def test_project_takes_one_series_of_a_dicom_folder(tmp_path, ct, workbook, scanner, capsys):
+def test_project_takes_one_series_of_a_dicom_folder(tmp_path, ct, small_workbook, scanner, capsys):
     """Equal to the radiograph of the volume, and the counts with the mu, from which the series was written."""
     affine = np.diag([2.0, 2, 3, 1])
     affine[:3, 3] = ct.grid.affine[:3, 3]
     ct = mph.Volume(ct.array, mph.Grid(ct.grid.shape, affine), "hu")
     write_series(mph.Volume(ct.array + 100, ct.grid, "hu"), tmp_path / "dicom", 3, "Soft")
     write_series(ct, tmp_path / "dicom", 4, "Lung")
-    common = ("project", workbook, "--modules", "1", "--size", 9, 9, "--backend", "numpy", "--center")
+    common = ("project", small_workbook, "--modules", "1", "--size", 9, 9, "--backend", "numpy", "--center")
     out, folder = tmp_path / "run.npz", tmp_path / "dicom"
     options = ("--energy", 80)
     assert run(*common, "--volume", folder, *options, "-o", out) == 1

@@ -8,8 +8,6 @@ from mphdrr.core.geometry.frames import affine_matrix, rotations
 
 from .conftest import refused
 
-AS_SHIPPED = True  # its bounds are of these counts
-
 PHOTONS = 1e5
 GRID = mph.Grid.centered(48, 3.0)
 BODY = mph.ShapePhantom([

@@ -7,17 +7,19 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..arrays import ArrayLike, Bools, Floats, Indexes
-from ..errors import InputError, several
+from ..errors import InputError, several, warn
 from ..geometry.system import PinholeSystem
 from ..geometry.views import Views
 from ..models.emission import Emission
 from ..models.model import with_image_axes
+from ..physics.energy_window import FWHM_PER_SIGMA
 from ..progress import Progress, stages_of
 from ..runs.display import DIVERGING, Display
 from ..runs.mosaic import MosaicSheet, draw_sheet
 from ..validation import instance, one_of, positive, real_array, shape_text
 from .bundle import LENGTH, OFFSET, BundleAdjustment, FittedGeometry
-from .point_images import PixelLattice
+from .calibration_checks import is_outlying, is_scale, warn_of_fit, warn_of_inputs
+from .point_images import SpotModel
 from .solvers import scipy_module
 from .spots import Spots, find_spots
 
@@ -32,6 +34,7 @@ _DISC_MISFIT = 5.0  # standard deviations by which an image may differ from a di
 _OUTLIER = 6.0  # standard deviations of an outlier from its fitted position
 _MAX_PRIOR = 5.0  # prior standard deviations by which a module's parameters may differ from the nominal ones
 _ROUNDS = 20
+_SPOT_ROUNDS = 6  # searches for spots, each with better known blur and magnifications
 _FALSE_ALARM = 1e-3  # probability that any module of a correct model is reported as misfitting
 _UNMOVED = 1e-6  # mm and degrees; smaller changes are rounding
 _DETERMINED = 0.75  # share of a parameter's prior variance that images must remove to determine it
@@ -80,6 +83,10 @@ class Calibration:
         Shift of the pixels on the crystal from those of the nominal views, mm along u and v.
     residuals : array (M, n_v, n_u)
         Counts around each module's spots, summed over its spots, minus expected counts, in standard deviations.
+    blur : array (M,)
+        FWHM of the crystals' blur, mm, fitted with one factor for all modules.
+    blur_sd : array (M,)
+        Standard deviations of `blur`, mm.
     """
 
     system: PinholeSystem
@@ -97,6 +104,8 @@ class Calibration:
     gauge: tuple[str, ...]
     detector_offset: Floats
     residuals: Floats
+    blur: Floats
+    blur_sd: Floats
 
     def untold(self) -> list[str]:
         """Return lines with the parameters that the images hardly determine, such as "modules 3, 17: length"."""
@@ -144,6 +153,7 @@ def calibrate(
     collimator_length_sd: float = 1.0,
     detector_offset_sd: float = 0.5,
     distance_sd: float = 0.02,
+    source_diameter: float = 0.0,
     progress: Progress | None = None,
 ) -> Calibration:
     """Determine the positions and tilts of a scanner's modules from images of point sources, one source per acquisition.
@@ -201,28 +211,42 @@ def calibrate(
     further = tuple(name for name in FITTED if name in fit)
     sd = [position_sd] * 3 + [math.radians(tilt_sd_degrees)] * 3 + [x for name in further for x in further_sd[name]]
     prior_sd = np.array([positive(x, "calibrate: standard deviations") for x in sd])
+    warn_of_inputs(model, images)
     pairs, lengths = _known_distances(distances, n_k)
     if points is not None and len(pairs):
         raise InputError("calibrate: give points or distances, not both")
-    lattice = PixelLattice.from_views(model, views)
-    radii = model.effective_diameter / 2 * (1 + system.collimator_length / system.pinhole_distance)
-    stages = stages_of(progress)
-    spots = find_spots(images, with_image_axes(model.background), lattice, radii, stages("finding spots"))
+    spot_model, stages = SpotModel.from_model(model, views, source_diameter), stages_of(progress)
+    background = with_image_axes(model.background)
+    magnification = np.tile(system.collimator_length / system.pinhole_distance, (n_k, 1))
+    sigma = np.broadcast_to(model.optics.intrinsic_fwhm, len(system)) / FWHM_PER_SIGMA
+    sigma = np.where(sigma > 0, sigma, np.abs(spot_model.lattice.step).mean())
+    spots = None
+    for _ in range(_SPOT_ROUNDS):  # the images' width depends on the blur, and on the points' distances
+        spots = find_spots(images, background, spot_model, sigma, magnification, spots, stages("finding spots"))
+        _require_spots(spots.seen, 2 if points is None else 1)
+        start = _triangulate_points(system, spots.centers, spots.seen) if points is None else points
+        start = real_array(start, "calibrate: points", (n_k, 3))
+        heights = np.einsum("mj,kmj->km", system.frames()[:, 2], start[:, None] - system.centers)
+        fits_window, sigma = (spots.sigma < 1.2 * sigma).all(), spots.sigma
+        magnification = system.collimator_length / np.maximum(heights, system.collimator_length)
+        if fits_window and (np.abs(magnification - spots.magnification) < 0.01).all():
+            break
     stages("finding modules")
-    _require_spots(spots.seen, 2 if points is None else 1)
-    positions = lattice.first + lattice.step * spots.pixels
-    covariance = spots.covariance * lattice.step[:, :, None] * lattice.step[:, None, :]
-    pearson, freedom = spots.pearson(lattice)
+    covariance, positions = spots.covariance[..., :2, :2].copy(), spots.centers.copy()
+    pearson, freedom = spots.pearson()
     # The centre of a spot that is not like a disc is less certain.
     ratio, limit = pearson / np.maximum(freedom, 1), 1 + _DISC_MISFIT * np.sqrt(2 / np.maximum(freedom, 1))
     covariance *= np.where(ratio > limit, ratio, 1.0)[..., None, None]
     covariance[~spots.seen], positions[~spots.seen] = np.eye(2), 0.0
     whitening = np.linalg.inv(np.linalg.cholesky(covariance))
-    start = _triangulate_points(system, positions, spots.seen) if points is None else points
-    start = real_array(start, "calibrate: points", (n_k, 3))
-    measured = positions, whitening, spots.seen, pairs, lengths, positive(distance_sd, "calibrate: distance_sd", "mm")
-    bundle, x = _fit_without_outliers(BundleAdjustment(system, start, points is None, further, prior_sd, *measured))
-    return _make_result(views, bundle, x, spots, lattice)
+    free = BundleAdjustment(
+        system, _triangulate_points(system, positions, spots.seen), True, further, prior_sd, positions, whitening,
+        spots.seen, pairs[:0], lengths[:0], positive(distance_sd, "calibrate: distance_sd", "mm"),
+    )  # fmt: skip
+    bundle = free if points is None and not len(pairs) else _with_known_sources(free, points, pairs, lengths)
+    spots = replace(spots, seen=bundle.used)
+    bundle, x = _fit_without_outliers(bundle)
+    return _make_result(views, bundle, x, spots)
 
 
 def _check_model(model: Emission, system: PinholeSystem, views: Views) -> None:
@@ -232,9 +256,7 @@ def _check_model(model: Emission, system: PinholeSystem, views: Views) -> None:
         raise InputError("calibrate: model: expected that of the system, Emission(system, ...)")
     model.check(views)
     is_uneven = np.ndim(model.efficiency) == 3 or not np.all(model.efficiency)
-    refused = {"edge 'path'": model.edge == "path", "depth_layers": model.depth_layers > 1}
-    refused |= {"wall_thickness": model.wall_thickness is not None}
-    refused |= {"lines apart": model.is_apart, "efficiency of single pixels, or of 0": is_uneven}
+    refused = {"wall_thickness": model.wall_thickness is not None, "lines apart": model.is_apart, "efficiency of single pixels, or of 0": is_uneven}
     for name, is_refused in refused.items():
         if is_refused:
             raise InputError(f"calibrate: model: takes no {name}: a spot is a hole's shadow on the crystal's front")
@@ -282,6 +304,47 @@ def _triangulate_points(system: PinholeSystem, positions: Floats, seen: Bools) -
     return points
 
 
+def _with_known_sources(
+    free: BundleAdjustment, points: Floats | None, pairs: Indexes, lengths: Floats
+) -> BundleAdjustment:
+    """Return the adjustment with known `points` (K, 3), or with known `lengths` (D,) of `pairs` (D, 2).
+
+    Where two modules or more see each point, the fit without them, `free`, tells whether they are of another scale, and are
+    then not used, and which of four points or three lengths are wrong. These are left out. All of it is warned of.
+    """
+    bundle = replace(free, pairs=pairs, distances=lengths)
+    if points is not None:
+        pairs = np.argwhere(np.triu(np.ones((len(points), len(points))), 1))
+        lengths = np.linalg.norm(points[pairs[:, 0]] - points[pairs[:, 1]], axis=1)
+        bundle = replace(free, points=points, fits_points=False)
+    if free.used.sum(axis=1).min() < 2:
+        return bundle
+    trial, x = _fit_without_outliers(free)
+    ends = trial.geometry(x).points[pairs]
+    fitted = np.maximum(np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1), 1e-9)
+    name = "distances" if points is None else "points"
+    scale, modules = float(np.median(lengths / fitted)), trial.used.any(axis=0)
+    if is_scale(scale, free.sd[0], free.system.pinhole_distance[modules]):
+        fault = f"{scale:.3g} times as far apart as the nominal modules see them"
+        warn(f"calibrate: {name}: they are {fault}, a scale; not used, the scale stays nominal")
+        return free
+    deviations = np.abs(lengths - scale * fitted)
+    if points is None:
+        is_wrong = is_outlying(deviations, free.distance_sd) if len(pairs) > 2 else np.zeros(len(pairs), bool)
+        texts = [f"{i + 1} to {j + 1}, {x:.2f} mm off" for (i, j), x in zip(pairs[is_wrong], deviations[is_wrong], strict=True)]
+        bundle = replace(bundle, pairs=pairs[~is_wrong], distances=lengths[~is_wrong])
+    else:
+        table = np.full((len(points), len(points)), np.nan)
+        table[tuple(pairs.T)] = table[tuple(pairs.T[::-1])] = deviations
+        typical = np.nanmedian(table, axis=1)
+        is_wrong = is_outlying(typical, free.distance_sd) & (len(points) > _MIN_POINTS)
+        texts = [f"{k + 1}, {np.nanmax(table[k]):.2f} mm off" for k in np.flatnonzero(is_wrong)]
+        bundle = replace(bundle, used=free.used & ~is_wrong[:, None])
+    if texts:
+        warn(f"calibrate: {name}: {several(texts, 12)}, as the others and the images tell; left out")
+    return bundle
+
+
 def _fit_without_outliers(bundle: BundleAdjustment) -> tuple[BundleAdjustment, Floats]:
     """Solve the adjustment repeatedly, each time without further outliers; return it without them, and its solution x."""
     x, robust = bundle.start(), True
@@ -309,7 +372,7 @@ def _fit_without_outliers(bundle: BundleAdjustment) -> tuple[BundleAdjustment, F
     return bundle, x
 
 
-def _make_result(views: Views, bundle: BundleAdjustment, x: Floats, spots: Spots, lattice: PixelLattice) -> Calibration:
+def _make_result(views: Views, bundle: BundleAdjustment, x: Floats, spots: Spots) -> Calibration:
     """Return the result of an adjustment with the solution x: geometry, uncertainties and tests of the fit."""
     nominal, fitted, seen, used = bundle.system, bundle.geometry(x), spots.seen, bundle.used
     covariance, leverages = bundle.covariance(x)
@@ -318,13 +381,14 @@ def _make_result(views: Views, bundle: BundleAdjustment, x: Floats, spots: Spots
     # Shifts along the axes of the fitted module instead of the nominal one.
     units[:, :3, :3] = fitted.frames @ nominal.frames().swapaxes(1, 2) * bundle.sd[:3]
     covariance = units @ covariance @ units.swapaxes(1, 2)
-    squared, (pearson, freedom) = bundle.spot_deviations(x) ** 2, spots.pearson(lattice)
+    squared, (pearson, freedom) = bundle.spot_deviations(x) ** 2, spots.pearson()
     spot_freedom, pixel_freedom = (2 * used - leverages).sum(axis=0), (seen * (freedom + 2) - leverages).sum(axis=0)
     sums = ((used * squared).sum(axis=0), spot_freedom), ((seen * (pearson + squared)).sum(axis=0), pixel_freedom)
     misfit, chi_square = (np.where(n > 0.5, total / np.maximum(n, 0.5), np.nan) for total, n in sums)
     misfits = (seen & ~used).any(axis=0) | _is_improbable(misfit, spot_freedom)
     misfits |= _is_improbable(chi_square, pixel_freedom)
-    expected = spots.expected(lattice, (fitted.project_points() - lattice.first) / lattice.step)
+    warn_of_fit(spots, used, fitted, chi_square)
+    expected = spots.expected(fitted.project_points())
     excess, total = ((seen[..., None, None] * w).sum(axis=0) for w in (spots.windows - expected, expected))
     further_names = {LENGTH: ("length",), OFFSET: ("offset u", "offset v")}
     names = (*_PARAMETERS, *(name for kind in bundle.fit for name in further_names[kind]))
@@ -333,7 +397,8 @@ def _make_result(views: Views, bundle: BundleAdjustment, x: Floats, spots: Spots
     return Calibration(system, nominal, _move_views(views, nominal, fitted), fitted.points, covariance[:, :6, :6],
                        chi_square, misfit, tuple(nominal.numbers[misfits].tolist()), used, names,
                        np.sqrt(np.diagonal(covariance, axis1=1, axis2=2)), told, gauge, fitted.offset,
-                       excess / np.sqrt(np.maximum(total, 1)))  # fmt: skip
+                       excess / np.sqrt(np.maximum(total, 1)), FWHM_PER_SIGMA * spots.sigma,
+                       FWHM_PER_SIGMA * spots.sigma_sd)  # fmt: skip
 
 
 def _is_improbable(per_freedom: Floats, freedom: Floats) -> Bools:

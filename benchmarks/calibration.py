@@ -1,16 +1,15 @@
-"""How well calibrations find a scanner, from photons that know nothing of the calibration's model: docs/calibrate.md's table.
+"""Errors of calibrations from photons that know nothing of the calibration's model: the table of docs/calibrate.md.
 
     python benchmarks/calibration.py [--draws 20] [--modules 80] [--only WORD]
 
-Photons are drawn one by one: a place in the source, one in the hole, accepted as often as photons go there and pass the edge;
-the depth in the crystal at which they stop, a Gaussian's shift, and the pixel in which they then are. Prints the rows of the
+Photons are drawn one by one: a place in the source, one in the hole, accepted as often as photons go there and pass the
+edge; the depth in the crystal at which they stop, a Gaussian's shift, and the pixel in which they then are. Prints the
 table.
 """
 
 from __future__ import annotations
 
 import argparse
-import time
 import warnings
 from pathlib import Path
 from typing import Any
@@ -23,25 +22,26 @@ WORKBOOK = Path(__file__).parents[1] / "examples" / "dc-spect-80.xlsx"
 TUNGSTEN, CZT = 3.597, 0.4041  # 1/mm, of 140.5 keV
 CASES = {
     "8 points, ± 40 mm": {"blur": 1.0},
-    "8 points, ± 40 mm, 2 mm": {"blur": 2.0},
+    "8 points, ± 40 mm; blur 2 mm": {"blur": 2.0},
     "5 points, ± 43 mm": {"n": 5, "blur": 1.0},
-    "5 points, ± 40 mm, 2 mm": {"n": 5, "size": 40.0, "blur": 2.0},
-    "blur told as 0": {"blur": 1.0, "told": {"intrinsic_fwhm": 0.0}},
-    "blur told as 3 mm": {"blur": 1.0, "told": {"intrinsic_fwhm": 3.0}},
-    "balls of 2 mm": {"blur": 1.0, "ball": 2.0, "options": {"source_diameter": 2.0}},
-    "cubes of 2 mm": {"blur": 1.0, "cube": 2.0, "options": {"source_diameter": 2.58}},
-    "tungsten edge": {"blur": 1.0, "edge_mu": TUNGSTEN, "told": {"aperture_mu": TUNGSTEN, "edge": "path"}},
-    "10 mm of CZT": {"blur": 1.0, "crystal_mu": CZT, "told": {"crystal_mu": CZT, "depth_layers": 5}},
+    "5 points, ± 40 mm; blur 2 mm": {"n": 5, "size": 40.0, "blur": 2.0},
+    "8 points; blur told as 0 mm": {"blur": 1.0, "told": {"intrinsic_fwhm": 0.0}},
+    "8 points; blur told as 3 mm": {"blur": 1.0, "told": {"intrinsic_fwhm": 3.0}},
+    "8 balls of 2 mm": {"blur": 1.0, "ball": 2.0, "options": {"source_diameter": 2.0}},
+    "8 cubes of 2 mm": {"blur": 1.0, "cube": 2.0, "options": {"source_diameter": 2.58}},
+    "8 points; tungsten edge": {"blur": 1.0, "edge_mu": TUNGSTEN, "told": {"aperture_mu": TUNGSTEN, "edge": "path"}},
+    "8 points; 10 mm of CZT": {"blur": 1.0, "crystal_mu": CZT, "told": {"crystal_mu": CZT, "depth_layers": 5}},
 }
 _EDGE_STEPS = 24  # along a photon's path through one half of the plate
 
 
 def sources(n: int, rng: np.random.Generator, size: float = 40.0) -> np.ndarray:
-    """Return n places (n, 3), mm, near the corners of a cube; fewer than eight are a tetrahedron and the middle."""
+    """Return n places (n, 3), mm, near the corners of a cube, or five near the middle and four corners."""
     corners = size * np.array(
-        [[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1], [0, 0, 0], [1, 1, -1], [-1, -1, -1], [1, -1, 1], [-1, 1, 1]]
+        [[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1], [1, 1, -1], [-1, -1, -1], [1, -1, 1], [-1, 1, 1]]
     )
-    return np.delete(corners, 4, axis=0)[:n] + rng.normal(0, 3, (n, 3)) if n > 5 else corners[:n] + rng.normal(0, 3, (n, 3))
+    places = corners if n > 5 else np.concatenate([np.zeros((1, 3)), corners])
+    return places[:n] + rng.normal(0, 3, (n, 3))
 
 
 def photon_images(
@@ -63,7 +63,10 @@ def photon_images(
         source = local[k, m] + cube * (rng.random((n, 3)) - 0.5)
         if ball:
             direction = rng.normal(size=(n, 3))
-            source = source + ball / 2 * rng.random((n, 1)) ** (1 / 3) * direction / np.linalg.norm(direction, axis=1)[:, None]
+            source = (
+                source
+                + ball / 2 * rng.random((n, 1)) ** (1 / 3) * direction / np.linalg.norm(direction, axis=1)[:, None]
+            )
         radius, angle = (hole + reach) * np.sqrt(rng.random(n)), 2 * np.pi * rng.random(n)
         place = radius[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
         slope = (source[:, :2] - place) / source[:, 2:]
@@ -85,7 +88,7 @@ def photon_images(
 
 
 def _path(place: np.ndarray, slope: np.ndarray, hole: float, reach: float) -> np.ndarray:
-    """Return the lengths along the axis, mm, for which photons through `place` (n, 2) are in the edge of a 90 degree cone."""
+    """Return the lengths along the axis, mm, in the edge of a 90 degree cone, of photons through `place` (n, 2)."""
     lengths, beyond = np.zeros(len(place)), np.hypot(*place.T) > 0.7 * hole
     steps = reach / _EDGE_STEPS
     for z in steps * (np.arange(-_EDGE_STEPS, _EDGE_STEPS) + 0.5):
@@ -149,20 +152,23 @@ def main() -> None:
     for name, case in CASES.items():
         if arguments.only not in name:
             continue
-        squares, ratios, chi_squares, blurs, seconds = [], [], [], [], 0.0
+        squares, ratios, chi_squares, blurs = [], [], [], []
         for seed in range(arguments.draws):
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", mph.InputWarning)
                 found, true = calibration(nominal, np.random.default_rng(seed), **case)
-            began = time.process_time()
             squares.append((errors(found, true) ** 2).mean(axis=0))
             ratios.append(consistency(found, true).mean())
             chi_squares.append(np.nanmean(found.chi_square))
             blurs.append(found.blur.mean())
-            seconds += time.process_time() - began
         u, v, k, *tilts = np.sqrt(np.mean(squares, axis=0))
         turns = np.degrees(tilts)
-        columns = f"{np.hypot(u, v) / 2**0.5:.3f}", f"{k:.3f}", f"{np.hypot(*turns[:2]) / 2**0.5:.3f}°", f"{turns[2]:.3f}°"
+        columns = (
+            f"{np.hypot(u, v) / 2**0.5:.3f}",
+            f"{k:.3f}",
+            f"{np.hypot(*turns[:2]) / 2**0.5:.3f}°",
+            f"{turns[2]:.3f}°",
+        )
         ratio = f"{np.mean(ratios):.2f} | {np.mean(chi_squares):.2f} | {np.mean(blurs):.3f} ± {np.std(blurs):.3f}"
         print(f"| {name} | {' | '.join(columns)} | {ratio} |", flush=True)
 

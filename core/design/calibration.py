@@ -133,6 +133,7 @@ class Calibration:
         return [
             f"{n_moved} of {len(shifts)} modules moved, RMS {mm:.2f} mm and {degrees:.2f} degrees",
             f"farthest: module {self.system.numbers[far]}, {shifts[far]:.2f} mm and {tilts[far]:.2f} degrees",
+            f"crystals' blur: FWHM {self.blur.mean():.3f} mm, known to {self.blur_sd.mean():.3f} mm",
             f"modules that do not fit: {misfitting}" if misfitting else "all modules fit",
             *([f"{gauge} of the scanner as a whole: nominal, these images do not determine them"] if gauge else []),
             *(f"not determined: {line}" for line in self.untold()),
@@ -256,7 +257,11 @@ def _check_model(model: Emission, system: PinholeSystem, views: Views) -> None:
         raise InputError("calibrate: model: expected that of the system, Emission(system, ...)")
     model.check(views)
     is_uneven = np.ndim(model.efficiency) == 3 or not np.all(model.efficiency)
-    refused = {"wall_thickness": model.wall_thickness is not None, "lines apart": model.is_apart, "efficiency of single pixels, or of 0": is_uneven}
+    refused = {
+        "wall_thickness": model.wall_thickness is not None,
+        "lines apart": model.is_apart,
+        "efficiency of single pixels, or of 0": is_uneven,
+    }
     for name, is_refused in refused.items():
         if is_refused:
             raise InputError(f"calibrate: model: takes no {name}: a spot is a hole's shadow on the crystal's front")
@@ -331,7 +336,10 @@ def _with_known_sources(
     deviations = np.abs(lengths - scale * fitted)
     if points is None:
         is_wrong = is_outlying(deviations, free.distance_sd) if len(pairs) > 2 else np.zeros(len(pairs), bool)
-        texts = [f"{i + 1} to {j + 1}, {x:.2f} mm off" for (i, j), x in zip(pairs[is_wrong], deviations[is_wrong], strict=True)]
+        texts = [
+            f"{i + 1} to {j + 1}, {x:.2f} mm off"
+            for (i, j), x in zip(pairs[is_wrong], deviations[is_wrong], strict=True)
+        ]
         bundle = replace(bundle, pairs=pairs[~is_wrong], distances=lengths[~is_wrong])
     else:
         table = np.full((len(points), len(points)), np.nan)

@@ -38,7 +38,7 @@ def is_scale(scale: float, position_sd: float, distances: Floats) -> bool:
 
 
 def is_outlying(deviations: Floats, sd: float) -> Bools:
-    """Return which absolute `deviations` (N,), mm, are larger than the others and the standard deviation `sd` make likely."""
+    """Return which absolute `deviations` (N,), mm, are too large beside the others and the standard deviation `sd`, mm."""
     return np.asarray(deviations > _SIGNIFICANT * np.maximum(sd, 2 * np.median(deviations)))
 
 
@@ -49,7 +49,9 @@ def warn_of_fit(spots: Spots, used: Bools, geometry: FittedGeometry, chi_square:
     """
     typical = float(np.nanmedian(chi_square)) if np.isfinite(chi_square).any() else 1.0
     if not _CHI_SQUARES[0] <= typical <= _CHI_SQUARES[1]:
-        causes = "the images are no counts but scaled, or the source, the holes' edge or the crystal are not the model's"
+        causes = (
+            "the images are no counts but scaled, or the source, the holes' edge or the crystal are not the model's"
+        )
         warn(f"calibrate: chi-square is {typical:.2g} in most modules, expected about 1: {causes}", 4)
     heights = np.einsum("mj,kmj->km", geometry.frames[:, 2], geometry.points[:, None] - geometry.centers)
     magnification = geometry.length / heights
@@ -66,6 +68,11 @@ def warn_of_fit(spots: Spots, used: Bools, geometry: FittedGeometry, chi_square:
     information = float((weights * squares**2).sum())
     slope = float((used * spots.score * squares).sum()) / max(information, 1e-30)
     if abs(slope) * information**0.5 > _SIGNIFICANT:
-        told, fitted = (math.sqrt(max(0.0, 20 * x)) for x in (spots.model.source_variance, spots.model.source_variance + slope))
+        told, fitted = (
+            math.sqrt(max(0.0, 20 * x)) for x in (spots.model.source_variance, spots.model.source_variance + slope)
+        )
         causes = f"sources are like balls of {fitted:.2g} mm instead of {told:g} mm (source_diameter)"
-        warn(f"calibrate: the more the spots are magnified, the {'wider' if slope > 0 else 'sharper'} they are: {causes}", 4)
+        warn(
+            f"calibrate: the more the spots are magnified, the {'wider' if slope > 0 else 'sharper'} they are: {causes}",
+            4,
+        )

@@ -92,7 +92,13 @@ class SpotModel:
                    attenuation, system.detector_thickness)  # fmt: skip
 
     def fractions(
-        self, centers: Floats, radii: Floats, sigma: Floats, magnification: Floats, shape: tuple[int, int], first: Any = 0
+        self,
+        centers: Floats,
+        radii: Floats,
+        sigma: Floats,
+        magnification: Floats,
+        shape: tuple[int, int],
+        first: Any = 0,
     ) -> tuple[Floats, Floats]:
         """Return the fractions (M, n_v, n_u) of each module's spot in the pixels of a window, and their derivatives.
 

@@ -85,7 +85,12 @@ class Spots:
 
 
 def find_spots(
-    images: Floats, background: Floats, model: SpotModel, sigma: Floats, magnification: Floats, start: Spots | None = None,
+    images: Floats,
+    background: Floats,
+    model: SpotModel,
+    sigma: Floats,
+    magnification: Floats,
+    start: Spots | None = None,
     progress: Progress | None = None,
 ) -> Spots:
     """Find the spots in images (K, M, n_v, n_u) of one point source per acquisition, and the crystals' blur.
@@ -115,7 +120,10 @@ def find_spots(
     pitch, size = np.abs(model.lattice.step), np.array(model.lattice.shape[::-1])
     reach = (radii.max(axis=0) + 3 * sigma + model.parallax)[:, None] / pitch
     n_u, n_v = np.minimum(2 * (np.ceil(reach.max(axis=0)).astype(int) + _MARGIN) + 1, size)
-    cut = [_cut_windows(x, np.broadcast_to(background, x.shape), model, r, (n_v, n_u)) for x, r in zip(images, radii, strict=True)]
+    cut = [
+        _cut_windows(x, np.broadcast_to(background, x.shape), model, r, (n_v, n_u))
+        for x, r in zip(images, radii, strict=True)
+    ]
     seen, values, first, windows, background_windows = (np.array(arrays) for arrays in zip(*cut, strict=True))
     if start is not None:
         values = np.where((start.seen & seen)[..., None], start.values, values)
@@ -183,7 +191,9 @@ def _maximize_likelihood(spots: Spots, is_first: bool, progress: Progress | None
             by_square = profile**2 / (2 * sigma)  # of sigma
             d_fractions[2] *= step >= n_first
             d_fractions[3] *= by_square[:, None, None]
-            gradient = np.stack([*counts * d_fractions[:3], fractions, np.ones_like(fractions), counts * d_fractions[3]], 1)
+            gradient = np.stack(
+                [*counts * d_fractions[:3], fractions, np.ones_like(fractions), counts * d_fractions[3]], 1
+            )
             gradient = gradient.reshape(*gradient.shape[:2], -1)  # of the expected counts, (M, 6, pixels)
             weighted = gradient / expected.reshape(len(gradient), 1, -1)
             excess = spots.windows[k] - expected

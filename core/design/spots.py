@@ -36,8 +36,6 @@ class Spots:
     """Magnifications (K, M)."""
     sigma: Floats
     """Standard deviations (M,) of the crystals' blur, mm."""
-    sigma_sd: Floats
-    """Standard deviations (M,) of `sigma`, mm."""
     seen: Bools
     """Mask (K, M) of the modules with a whole spot."""
     values: Floats
@@ -55,6 +53,13 @@ class Spots:
     """Derivatives (K, M) of the likelihood's logarithm by the square of the largest `sigma`, 1/mm^2."""
     gain: Floats
     """Information (K, M) of each spot on this square, 1/mm^4."""
+
+    @property
+    def sigma_sd(self) -> Floats:
+        """Standard deviations (M,) of `sigma`, mm."""
+        square_sd = max(float(self.gain[self.seen].sum()), 1e-30) ** -0.5
+        widest = float(self.sigma.max())
+        return self.sigma / widest * min(square_sd / (2 * widest), square_sd**0.5)
 
     @property
     def centers(self) -> Floats:
@@ -124,12 +129,12 @@ def find_spots(
         _cut_windows(x, np.broadcast_to(background, x.shape), model, r, (n_v, n_u))
         for x, r in zip(images, radii, strict=True)
     ]
-    seen, values, first, windows, background_windows = (np.array(arrays) for arrays in zip(*cut, strict=True))
+    seen, values, first, windows, known = (np.array(arrays) for arrays in zip(*cut, strict=True))
     if start is not None:
         values = np.where((start.seen & seen)[..., None], start.values, values)
-    spots = Spots(model, magnification, sigma, 0 * sigma, seen, values, np.zeros((*seen.shape, 3, 3)), first, windows,
-                  background_windows, 0.0 * seen, 0.0 * seen)  # fmt: skip
-    spots = _maximize_likelihood(spots, start is None, progress)
+    nothing = np.zeros((*seen.shape, 3, 3)), first, windows, known, 0.0 * seen, 0.0 * seen
+    spots = Spots(model, magnification, sigma, seen, values, *nothing)
+    spots = _maximize_likelihood(spots, _FIRST_STEPS if start is None else 0, progress)
     pixels = (spots.centers - model.lattice.first) / model.lattice.step
     inside = np.minimum(pixels, size - 1 - pixels) + 0.5 >= spots.values[..., 2, None] / pitch
     inside &= np.abs(pixels - first - [n_u // 2, n_v // 2]) < [n_u // 2, n_v // 2]
@@ -162,70 +167,65 @@ def _cut_windows(
     return seen, np.column_stack([centers, radii, np.maximum(totals, 1.0), uniform]), first, windows, known
 
 
-def _maximize_likelihood(spots: Spots, is_first: bool, progress: Progress | None = None) -> Spots:
+def _maximize_likelihood(spots: Spots, n_first: int, progress: Progress | None) -> Spots:
     """Return the spots with the values and the blur of the largest likelihood, from those that they have.
 
-    A background at its lower limit is returned as 0.
+    During `n_first` steps the radii stay. A background at its lower limit is returned as 0.
     """
-    model, values, seen = spots.model, spots.values.copy(), spots.seen
-    pitch = np.abs(model.lattice.step)
-    profile = spots.sigma / spots.sigma.max()  # of the modules' blur
-    square, square_sd = float(spots.sigma.max() ** 2), 0.0
-    expected_radii = model.hole_radius * (1 + spots.magnification)
-    most_square = 4 * square  # a wider blur needs larger windows
-    n_first = _FIRST_STEPS if is_first else 0
-    least = (_MIN_BLUR * float(pitch.min())) ** 2
-    covariance = spots.covariance.copy()
+    values, seen, pitch = spots.values.copy(), spots.seen, np.abs(spots.model.lattice.step)
+    profile, square = spots.sigma / spots.sigma.max(), float(spots.sigma.max()) ** 2
+    limits = (_MIN_BLUR * float(pitch.min())) ** 2, 4 * square  # a wider blur needs larger windows
+    radii = spots.model.hole_radius * (1 + spots.magnification)
     for step in range(_STEPS):
         tell(progress, step, _STEPS)
-        sigma = profile * np.sqrt(square)
-        terms = []
-        floor = _MIN_BACKGROUND * values[..., 3] * pitch.prod(axis=1) / (np.pi * (values[..., 2] ** 2 + 4 * sigma**2))
+        spots = replace(spots, values=values, sigma=profile * square**0.5)
+        floor = _MIN_BACKGROUND * values[..., 3] * pitch.prod(axis=1) / (np.pi * (radii**2 + 4 * spots.sigma**2))
         values[..., 4] = np.maximum(values[..., 4], floor)
-        for k, known in enumerate(spots.background):
-            fractions, d_fractions = model.fractions(
-                values[k, :, :2], values[k, :, 2], sigma, spots.magnification[k], known.shape[1:], spots.first[k]
-            )
-            counts, uniform = values[k, :, 3:, None, None].swapaxes(0, 1)
-            expected = counts * fractions + uniform + known
-            by_square = profile**2 / (2 * sigma)  # of sigma
-            d_fractions[2] *= step >= n_first
-            d_fractions[3] *= by_square[:, None, None]
-            gradient = np.stack(
-                [*counts * d_fractions[:3], fractions, np.ones_like(fractions), counts * d_fractions[3]], 1
-            )
-            gradient = gradient.reshape(*gradient.shape[:2], -1)  # of the expected counts, (M, 6, pixels)
-            weighted = gradient / expected.reshape(len(gradient), 1, -1)
-            excess = spots.windows[k] - expected
-            chi_square = (excess**2 / np.maximum(expected, 1)).sum((1, 2)) / (expected >= 1).sum((1, 2)).clip(1)
-            information = weighted @ gradient.swapaxes(1, 2)
-            slope = (weighted @ excess.reshape(len(gradient), -1, 1))[..., 0]
-            diagonal = information.diagonal(axis1=1, axis2=2)[:, :5]
-            information[:, :5, :5] += (1e-9 * diagonal + 1e-30)[:, :, None] * np.eye(5)
-            inverse = np.linalg.inv(information[:, :5, :5])
-            along = (inverse @ information[:, :5, 5:])[..., 0]  # change of the values by the blur's square
-            steps = (inverse @ slope[:, :5, None])[..., 0]
-            rest = slope[:, 5] - (along * slope[:, :5]).sum(axis=1)
-            known_better = information[:, 5, 5] - (along * information[:, :5, 5]).sum(axis=1)
-            covariance[k] = inverse[:, :3, :3]
-            terms.append((steps, along, rest, known_better, chi_square, np.sqrt(inverse.diagonal(axis1=1, axis2=2))))
-        steps, along, score, gain, chi_square, sd = map(np.array, zip(*terms, strict=True))
+        terms = (_normal_equations(spots, k, step < n_first) for k in range(len(values)))
+        slope, information, chi_square = (np.array(arrays) for arrays in zip(*terms, strict=True))
+        covariance = np.linalg.inv(information[..., :5, :5])
+        along = (covariance @ information[..., :5, 5:])[..., 0]  # changes of the values by the blur's square
+        score = slope[..., 5] - (along * slope[..., :5]).sum(axis=2)
+        gain = information[..., 5, 5] - (along * information[..., :5, 5]).sum(axis=2)
         good = seen & (chi_square <= _MAX_CHI_SQUARE * np.median(chi_square[seen])) if seen.any() else seen
         total = max(float(gain[good].sum()), 1e-30)
-        change = float(np.clip(square + score[good].sum() / total, max(square / 4, least), most_square)) - square
-        steps -= along * change
-        square, square_sd = square + change, total**-0.5
+        before, square = (
+            square,
+            float(np.clip(square + score[good].sum() / total, max(square / 4, limits[0]), limits[1])),
+        )
+        steps = (covariance @ slope[..., :5, None])[..., 0] - along * (square - before)
         # A step moves the centre by at most half a radius, and changes radius and counts by at most half.
-        most = 0.5 * values[..., [2, 2, 2, 3]]
-        steps *= np.minimum((most / np.maximum(np.abs(steps[..., :4]), 1e-30)).min(axis=2), 1.0)[..., None]
-        values += steps
-        values[..., 2] = np.clip(values[..., 2], *(limit * expected_radii for limit in _RADII))
-        size = np.abs(steps) / sd
+        most = 0.5 * values[..., [2, 2, 2, 3]] / np.maximum(np.abs(steps[..., :4]), 1e-30)
+        values = values + steps * np.minimum(most.min(axis=2), 1.0)[..., None]
+        values[..., 2] = np.clip(values[..., 2], *(limit * radii for limit in _RADII))
+        size = np.abs(steps) / np.sqrt(covariance.diagonal(axis1=2, axis2=3))
         size[..., 4] *= values[..., 4] > 1.01 * floor  # a background at its limit cannot decrease further
-        if step >= n_first and size[seen].max(initial=0.0) < _CONVERGED and abs(change) < 0.1 * square_sd:
+        if step >= n_first and size[seen].max(initial=0.0) < _CONVERGED and abs(square - before) * total**0.5 < 0.1:
             break
-    tell(progress, _STEPS, _STEPS)
     values[..., 4] = np.where(values[..., 4] > 1.01 * floor, values[..., 4], 0.0)
-    sigma = profile * np.sqrt(square)
-    sigma_sd = profile * min(square_sd / (2 * np.sqrt(square)), np.sqrt(square_sd))
-    return replace(spots, values=values, covariance=covariance, sigma=sigma, sigma_sd=sigma_sd, score=score, gain=gain)
+    return replace(
+        spots, values=values, sigma=profile * square**0.5, covariance=covariance[..., :3, :3], score=score, gain=gain
+    )
+
+
+def _normal_equations(spots: Spots, k: int, holds_radius: bool) -> tuple[Floats, Floats, Floats]:
+    """Return the likelihood's slope (M, 6) by acquisition k's values and the blur's square, and the information (M, 6, 6).
+
+    The third array is chi-square per pixel (M,). With `holds_radius` the radii have no influence.
+    """
+    values, windows, known = spots.values[k], spots.windows[k], spots.background[k]
+    fractions, gradient = spots.model.fractions(
+        values[:, :2], values[:, 2], spots.sigma, spots.magnification[k], known.shape[1:], spots.first[k]
+    )
+    counts, uniform = values.T[3:, :, None, None]
+    expected = counts * fractions + uniform + known
+    gradient[2] *= not holds_radius
+    gradient[3] *= (spots.sigma / (2 * spots.sigma.max() ** 2))[:, None, None]
+    gradient = np.stack([*counts * gradient[:3], fractions, np.ones_like(fractions), counts * gradient[3]], axis=1)
+    gradient = gradient.reshape(len(values), 6, -1)  # of the expected counts
+    weighted = gradient / expected.reshape(len(values), 1, -1)
+    information = weighted @ gradient.swapaxes(1, 2)
+    information += (1e-9 * information.diagonal(axis1=1, axis2=2) + 1e-30)[:, :, None] * np.eye(6)
+    slope = (weighted @ (windows - expected).reshape(len(values), -1, 1))[..., 0]
+    bright = np.maximum(expected, 1)
+    return slope, information, ((windows - expected) ** 2 / bright).sum((1, 2)) / (expected >= 1).sum((1, 2)).clip(1)

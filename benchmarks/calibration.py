@@ -1,6 +1,6 @@
 """Errors of calibrations from photons that know nothing of the calibration's model: the table of docs/calibrate.md.
 
-    python benchmarks/calibration.py [--draws 20] [--modules 80] [--only WORD]
+    python benchmarks/calibration.py [--draws 20] [--modules 40] [--only WORD]
 
 Photons are drawn one by one: a place in the source, one in the hole, accepted as often as photons go there and pass the
 edge; the depth in the crystal at which they stop, a Gaussian's shift, and the pixel in which they then are. Prints the
@@ -143,7 +143,7 @@ def main() -> None:
     """Print the rows of the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--draws", type=int, default=20)
-    parser.add_argument("--modules", type=int, default=80)
+    parser.add_argument("--modules", type=int, default=40)
     parser.add_argument("--only", default="", help="cases with this word")
     arguments = parser.parse_args()
     whole = mph.read_system(WORKBOOK)

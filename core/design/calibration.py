@@ -13,12 +13,12 @@ from ..geometry.views import Views
 from ..models.emission import Emission
 from ..models.model import with_image_axes
 from ..physics.energy_window import FWHM_PER_SIGMA
-from ..progress import Progress, stages_of
+from ..progress import Progress, Stages, stages_of
 from ..runs.display import DIVERGING, Display
 from ..runs.mosaic import MosaicSheet, draw_sheet
 from ..validation import instance, one_of, positive, real_array, shape_text
 from .bundle import LENGTH, OFFSET, BundleAdjustment, FittedGeometry
-from .calibration_checks import is_outlying, is_scale, warn_of_fit, warn_of_inputs
+from .calibration_checks import warn_of_fit, warn_of_inputs
 from .point_images import SpotModel
 from .solvers import scipy_module
 from .spots import Spots, find_spots
@@ -34,6 +34,9 @@ _DISC_MISFIT = 5.0  # standard deviations by which an image may differ from a di
 _OUTLIER = 6.0  # standard deviations of an outlier from its fitted position
 _MAX_PRIOR = 5.0  # prior standard deviations by which a module's parameters may differ from the nominal ones
 _ROUNDS = 20
+_MAX_SCALE = 0.02  # by which known lengths may differ from those that nominal modules see
+_FAR = 5.0  # typical deviations by which a known place, length or scale may differ from what images tell
+_SAME_MAGNIFICATION = 0.01
 _SPOT_ROUNDS = 6  # searches for spots, each with better known blur and magnifications
 _FALSE_ALARM = 1e-3  # probability that any module of a correct model is reported as misfitting
 _UNMOVED = 1e-6  # mm and degrees; smaller changes are rounding
@@ -160,9 +163,9 @@ def calibrate(
     """Determine the positions and tilts of a scanner's modules from images of point sources, one source per acquisition.
 
     In each of K acquisitions, the centre of each module's spot is found by maximum likelihood (Poisson), with the shadow of
-    the hole in closed form. The spot's counts and radius and a uniform background are free, so that neither activities nor
-    hole diameters need be known. Modules and points are the least-squares solution for all centres (SciPy). Images that do
-    not fit are not used, and their modules are reported.
+    the hole in closed form. The spot's counts and radius and a uniform background are free, and so is a factor of all
+    crystals' blur: neither activities nor hole diameters nor the blur need be known. Modules and points are the
+    least-squares solution for all centres (SciPy). Images that do not fit are not used, and their modules are reported.
 
     Parameters
     ----------
@@ -178,8 +181,9 @@ def calibrate(
         Known distances (K, K) between sources, mm, NaN for unknown ones; they determine the scale. None: the scale stays
         nominal.
     model
-        Emission model with the holes, the crystal's blur and the background. None: a crystal without blur, whose sharp
-        shadows make the covariances too small for a crystal with blur.
+        Emission model with the holes and their edge, the crystals with their depth of interaction (`depth_layers`), and the
+        background. The fit of the blur starts from `intrinsic_fwhm`, of which modules keep their ratios, or from a pixel's
+        width. None: ``Emission(system)``.
     fit
         Parameters that are fitted besides positions and tilts, of "collimator_length" and "detector_offset".
     position_sd, tilt_sd_degrees, collimator_length_sd, detector_offset_sd
@@ -187,14 +191,22 @@ def calibrate(
         weak compared with images; a parameter that no image determines stays nominal.
     distance_sd
         Standard deviation of the known distances, mm.
+    source_diameter
+        Diameter of the sources, balls, mm; 1.29 times the side of cubes. 0: points.
     progress
-        Called with (done, total) acquisitions.
+        Called with (done, total) steps of each search for spots.
 
     Raises
     ------
     InputError
         There are too few points, an acquisition shows none, images and views are not of the system, most modules are farther
         from the nominal geometry than allowed, or SciPy is missing.
+
+    Warns
+    -----
+    InputWarning
+        Known places or distances are of another scale, or some are wrong (these are not used); images are no counts; spots
+        are wider than holes and sources let expect; a crystal of more than 2 mm has no depth of interaction.
     """
     instance(system, PinholeSystem, "calibrate: system")
     instance(views, Views, "calibrate: views")
@@ -216,22 +228,8 @@ def calibrate(
     pairs, lengths = _known_distances(distances, n_k)
     if points is not None and len(pairs):
         raise InputError("calibrate: give points or distances, not both")
-    spot_model, stages = SpotModel.from_model(model, views, source_diameter), stages_of(progress)
-    background = with_image_axes(model.background)
-    magnification = np.tile(system.collimator_length / system.pinhole_distance, (n_k, 1))
-    sigma = np.broadcast_to(model.optics.intrinsic_fwhm, len(system)) / FWHM_PER_SIGMA
-    sigma = np.where(sigma > 0, sigma, np.abs(spot_model.lattice.step).mean())
-    spots = None
-    for _ in range(_SPOT_ROUNDS):  # the images' width depends on the blur, and on the points' distances
-        spots = find_spots(images, background, spot_model, sigma, magnification, spots, stages("finding spots"))
-        _require_spots(spots.seen, 2 if points is None else 1)
-        start = _triangulate_points(system, spots.centers, spots.seen) if points is None else points
-        start = real_array(start, "calibrate: points", (n_k, 3))
-        heights = np.einsum("mj,kmj->km", system.frames()[:, 2], start[:, None] - system.centers)
-        fits_window, sigma = (spots.sigma < 1.2 * sigma).all(), spots.sigma
-        magnification = system.collimator_length / np.maximum(heights, system.collimator_length)
-        if fits_window and (np.abs(magnification - spots.magnification) < 0.01).all():
-            break
+    known, stages = None if points is None else real_array(points, "calibrate: points", (n_k, 3)), stages_of(progress)
+    spots, start = _find_spots(images, model, SpotModel.from_model(model, views, source_diameter), known, stages)
     stages("finding modules")
     covariance, positions = spots.covariance[..., :2, :2].copy(), spots.centers.copy()
     pearson, freedom = spots.pearson()
@@ -240,31 +238,52 @@ def calibrate(
     covariance *= np.where(ratio > limit, ratio, 1.0)[..., None, None]
     covariance[~spots.seen], positions[~spots.seen] = np.eye(2), 0.0
     whitening = np.linalg.inv(np.linalg.cholesky(covariance))
-    free = BundleAdjustment(
-        system, _triangulate_points(system, positions, spots.seen), True, further, prior_sd, positions, whitening,
-        spots.seen, pairs[:0], lengths[:0], positive(distance_sd, "calibrate: distance_sd", "mm"),
-    )  # fmt: skip
-    bundle = free if points is None and not len(pairs) else _with_known_sources(free, points, pairs, lengths)
+    length_sd = positive(distance_sd, "calibrate: distance_sd", "mm")
+    measured = positions, whitening, spots.seen, pairs[:0], lengths[:0], length_sd
+    bundle = BundleAdjustment(system, start, True, further, prior_sd, *measured)
+    if points is not None or len(pairs):
+        bundle = _with_known_sources(bundle, points is not None, pairs, lengths)
     spots = replace(spots, seen=bundle.used)
     bundle, x = _fit_without_outliers(bundle)
     return _make_result(views, bundle, x, spots)
 
 
+def _find_spots(
+    images: Floats, model: Emission, spot_model: SpotModel, points: Floats | None, stages: Stages
+) -> tuple[Spots, Floats]:
+    """Return the spots in `images` (K, M, n_v, n_u), and the points (K, 3), mm: known ones, or a start of their fit.
+
+    The spots' widths depend on the blur and on the points' distances, so they are searched for several times.
+    """
+    system, spots = model.system, None
+    magnification = np.tile(system.collimator_length / system.pinhole_distance, (len(images), 1))
+    sigma = np.broadcast_to(model.optics.intrinsic_fwhm, len(system)) / FWHM_PER_SIGMA
+    sigma = np.where(sigma > 0, sigma, np.abs(spot_model.lattice.step).mean())
+    for _ in range(_SPOT_ROUNDS):
+        background = with_image_axes(model.background)
+        spots = find_spots(images, background, spot_model, sigma, magnification, spots, stages("finding spots"))
+        _require_spots(spots.seen, 2 if points is None else 1)
+        start = _triangulate_points(system, spots.centers, spots.seen) if points is None else points
+        heights = np.einsum("mj,kmj->km", system.frames()[:, 2], start[:, None] - system.centers)
+        fits_window, sigma = (spots.sigma < 1.2 * sigma).all(), spots.sigma
+        magnification = system.collimator_length / np.maximum(heights, system.collimator_length)
+        if fits_window and (np.abs(magnification - spots.magnification) < _SAME_MAGNIFICATION).all():
+            break
+    return spots, start  # type: ignore[return-value]  # after one round at least
+
+
 def _check_model(model: Emission, system: PinholeSystem, views: Views) -> None:
-    """Raise `InputError` unless the model is that of the system and of a hole's shadow on the crystal's front."""
+    """Raise `InputError` unless the model is that of the system and of a hole's shadow."""
     instance(model, Emission, "calibrate: model")
     if len(model.system) != len(system) or not np.allclose(model.system.poses(), system.poses()):
         raise InputError("calibrate: model: expected that of the system, Emission(system, ...)")
     model.check(views)
     is_uneven = np.ndim(model.efficiency) == 3 or not np.all(model.efficiency)
-    refused = {
-        "wall_thickness": model.wall_thickness is not None,
-        "lines apart": model.is_apart,
-        "efficiency of single pixels, or of 0": is_uneven,
-    }
+    refused = {"wall_thickness": model.wall_thickness is not None, "lines apart": model.is_apart}
+    refused["efficiency of single pixels, or of 0"] = is_uneven
     for name, is_refused in refused.items():
         if is_refused:
-            raise InputError(f"calibrate: model: takes no {name}: a spot is a hole's shadow on the crystal's front")
+            raise InputError(f"calibrate: model: takes no {name}: a spot is a hole's shadow")
 
 
 def _known_distances(distances: ArrayLike | None, n_k: int) -> tuple[Indexes, Floats]:
@@ -309,48 +328,43 @@ def _triangulate_points(system: PinholeSystem, positions: Floats, seen: Bools) -
     return points
 
 
-def _with_known_sources(
-    free: BundleAdjustment, points: Floats | None, pairs: Indexes, lengths: Floats
-) -> BundleAdjustment:
-    """Return the adjustment with known `points` (K, 3), or with known `lengths` (D,) of `pairs` (D, 2).
+def _with_known_sources(free: BundleAdjustment, are_points: bool, pairs: Indexes, lengths: Floats) -> BundleAdjustment:
+    """Return the adjustment with the known `lengths` (D,), mm, of `pairs` (D, 2), or with its points as the known ones.
 
-    Where two modules or more see each point, the fit without them, `free`, tells whether they are of another scale, and are
+    Where two modules or more see each point, the fit without these, `free`, tells whether they are of another scale, and are
     then not used, and which of four points or three lengths are wrong. These are left out. All of it is warned of.
     """
-    bundle = replace(free, pairs=pairs, distances=lengths)
-    if points is not None:
-        pairs = np.argwhere(np.triu(np.ones((len(points), len(points))), 1))
-        lengths = np.linalg.norm(points[pairs[:, 0]] - points[pairs[:, 1]], axis=1)
-        bundle = replace(free, points=points, fits_points=False)
+    bundle, points, n_k = replace(free, pairs=pairs, distances=lengths), free.points, len(free.points)
+    groups, labels, name = (
+        np.eye(len(pairs)) > 0,
+        [f"{i} to {j}" for i, j in pairs + 1],
+        "distances",
+    )  # that are right or wrong
+    if are_points:
+        bundle, pairs = replace(free, fits_points=False), np.argwhere(np.triu(np.ones((n_k, n_k)), 1))
+        lengths = np.linalg.norm(np.diff(points[pairs], axis=1)[:, 0], axis=1)
+        groups, name = (pairs == np.arange(n_k)[:, None, None]).any(axis=2), "points"
+        labels = [str(k + 1) for k in range(n_k)]
     if free.used.sum(axis=1).min() < 2:
         return bundle
     trial, x = _fit_without_outliers(free)
-    ends = trial.geometry(x).points[pairs]
-    fitted = np.maximum(np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1), 1e-9)
-    name = "distances" if points is None else "points"
-    scale, modules = float(np.median(lengths / fitted)), trial.used.any(axis=0)
-    if is_scale(scale, free.sd[0], free.system.pinhole_distance[modules]):
+    fitted = np.linalg.norm(np.diff(trial.geometry(x).points[pairs], axis=1)[:, 0], axis=1)
+    scale, modules = float(np.median(lengths / np.maximum(fitted, 1e-9))), trial.used.any(axis=0)
+    scale_sd = free.sd[0] / (free.system.pinhole_distance[modules].mean() * math.sqrt(modules.sum()))
+    if abs(scale - 1) > max(_MAX_SCALE, _FAR * scale_sd):
         fault = f"{scale:.3g} times as far apart as the nominal modules see them"
         warn(f"calibrate: {name}: they are {fault}, a scale; not used, the scale stays nominal")
         return free
-    deviations = np.abs(lengths - scale * fitted)
-    if points is None:
-        is_wrong = is_outlying(deviations, free.distance_sd) if len(pairs) > 2 else np.zeros(len(pairs), bool)
-        texts = [
-            f"{i + 1} to {j + 1}, {x:.2f} mm off"
-            for (i, j), x in zip(pairs[is_wrong], deviations[is_wrong], strict=True)
-        ]
-        bundle = replace(bundle, pairs=pairs[~is_wrong], distances=lengths[~is_wrong])
-    else:
-        table = np.full((len(points), len(points)), np.nan)
-        table[tuple(pairs.T)] = table[tuple(pairs.T[::-1])] = deviations
-        typical = np.nanmedian(table, axis=1)
-        is_wrong = is_outlying(typical, free.distance_sd) & (len(points) > _MIN_POINTS)
-        texts = [f"{k + 1}, {np.nanmax(table[k]):.2f} mm off" for k in np.flatnonzero(is_wrong)]
-        bundle = replace(bundle, used=free.used & ~is_wrong[:, None])
-    if texts:
+    errors = np.abs(lengths - scale * fitted)
+    typical = np.array([np.median(errors[group]) for group in groups])
+    is_wrong = typical > _FAR * max(free.distance_sd, 2 * float(np.median(typical)))
+    is_wrong &= len(groups) > (3 if are_points else 2)
+    if is_wrong.any():
+        texts = (f"{labels[i]}, {errors[groups[i]].max():.2f} mm off" for i in np.flatnonzero(is_wrong))
         warn(f"calibrate: {name}: {several(texts, 12)}, as the others and the images tell; left out")
-    return bundle
+    if are_points:
+        return replace(bundle, used=free.used & ~is_wrong[:, None])
+    return replace(bundle, pairs=pairs[~is_wrong], distances=lengths[~is_wrong])
 
 
 def _fit_without_outliers(bundle: BundleAdjustment) -> tuple[BundleAdjustment, Floats]:

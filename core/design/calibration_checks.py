@@ -11,8 +11,7 @@ from .bundle import FittedGeometry
 from .spots import Spots
 
 _THICK = 2.0  # mm; in thicker crystals the depth of interaction moves oblique spots
-_MAX_SCALE = 0.02  # by which known lengths may differ from the fitted ones
-_SIGNIFICANT = 5.0  # standard deviations, or typical deviations
+_SIGNIFICANT = 5.0  # standard deviations
 _MAX_WIDENING = 0.03  # of the spots' radii, relative to the hole's shadow
 _CHI_SQUARES = 0.5, 2.0  # limits of the median
 
@@ -26,20 +25,6 @@ def warn_of_inputs(model: Emission, images: Floats) -> None:
     if (fractional := images[images != np.rint(images)]).size:
         expected = f"expected counts, whole numbers, got {fractional[0]:g}"
         warn(f"calibrate: images: {expected}; standard deviations hold for counts that are not scaled")
-
-
-def is_scale(scale: float, position_sd: float, distances: Floats) -> bool:
-    """Return whether known lengths are of another scale than nominal modules, `scale` times the fitted lengths.
-
-    The fitted scale is that of the mean of the modules' `distances` (M,), mm, each of which is known to `position_sd`, mm.
-    """
-    limit = _SIGNIFICANT * position_sd / float(distances.mean() * np.sqrt(len(distances)))
-    return abs(scale - 1) > max(_MAX_SCALE, limit)
-
-
-def is_outlying(deviations: Floats, sd: float) -> Bools:
-    """Return which absolute `deviations` (N,), mm, are too large beside the others and the standard deviation `sd`, mm."""
-    return np.asarray(deviations > _SIGNIFICANT * np.maximum(sd, 2 * np.median(deviations)))
 
 
 def warn_of_fit(spots: Spots, used: Bools, geometry: FittedGeometry, chi_square: Floats) -> None:

@@ -71,10 +71,10 @@ class SpotModel:
     """Variances (M,) of the Gaussians, in the hole's plane, that soften the holes' edges, mm^2."""
     source_variance: float
     """Variance of the source along each axis, mm^2."""
-    attenuation: Floats | None
-    """Attenuation coefficients (M,) of the crystals, 1/mm. None: photons are recorded at the crystal's front."""
+    attenuation: Floats
+    """Attenuation coefficients (M,) of the crystals, 1/mm."""
     thickness: Floats
-    """Thicknesses (M,) of the crystals, mm."""
+    """Thicknesses (M,) of the crystals, mm; 0 records photons where they enter."""
 
     @classmethod
     def from_model(cls, model: Emission, views: Views, source_diameter: float = 0.0) -> "SpotModel":
@@ -87,9 +87,10 @@ class SpotModel:
         second = hole**4 / 4 + reach * (hole**3 + 3 * hole**2 * reach + 6 * hole * reach**2 + 6 * reach**3)
         radius = hole + reach if model.edge == "path" else model.effective_diameter / 2
         edge_variance = second / (hole**2 + 2 * reach * (hole + reach)) - (hole + reach) ** 2 / 4
-        attenuation = one_for_all(model.optics.crystal_mu, "crystal_mu", n) if model.depth_layers > 1 else None
+        depth = system.detector_thickness * (model.depth_layers > 1)
         return cls(PixelLattice.from_views(model, views), system.collimator_length, radius, edge_variance, variance,
-                   attenuation, system.detector_thickness)  # fmt: skip
+                   one_for_all(0.0 if model.optics.crystal_mu is None else model.optics.crystal_mu, "crystal_mu", n),
+                   depth)  # fmt: skip
 
     def fractions(
         self,
@@ -129,19 +130,11 @@ class SpotModel:
         gradient[3] *= (sigma / np.maximum(blur, 1e-12))[:, None, None]
         return fractions, gradient
 
-    @property
-    def parallax(self) -> Floats:
-        """Largest distances (M,) on the crystals, mm, from where photons enter to where they are recorded on average."""
-        if self.attenuation is None:
-            return np.zeros(len(self.length))
-        corner = np.abs(self.lattice.first).max(axis=1)
-        return corner / self.length * np.minimum(self.thickness / 2, 2 / self.attenuation)
-
     def _depths(self, centers: Floats) -> tuple[Floats, Floats]:
         """Return weights (M, Q) of depths z in the crystals for photons towards `centers`, and ratios (M, Q) 1 + z / l."""
-        if self.attenuation is None:
-            return np.ones((2, len(centers), 1))
-        nodes, weights = np.polynomial.legendre.leggauss(_DEPTHS)
+        if not self.thickness.any():
+            return np.ones((len(centers), 1)), np.ones((len(centers), 1))
+        nodes, weights = scipy_module("special").roots_legendre(_DEPTHS)
         rate = self.attenuation * np.sqrt(1 + (centers**2).sum(axis=1) / self.length**2)
         depths = np.minimum(self.thickness, _MAX_OPTICAL_DEPTH / rate)[:, None] * (nodes + 1) / 2
         weights = weights * np.exp(-rate[:, None] * depths)

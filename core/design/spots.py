@@ -7,6 +7,7 @@ a module's position.
 """
 
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -69,7 +70,7 @@ class Spots:
     def expected(self, centers: Floats) -> Floats:
         """Return the expected counts in the windows (K, M, n_v, n_u) for spots at `centers` (K, M, 2), mm."""
         spots = zip(centers, self.values[..., 2], self.magnification, self.first, strict=True)
-        shape = self.windows.shape[2:]
+        shape = self.windows.shape[2], self.windows.shape[3]
         fractions = [self.model.fractions(x, r, self.sigma, m, shape, first)[0] for x, r, m, first in spots]
         counts, uniform = (self.values[..., i, None, None] for i in (3, 4))
         return counts * fractions + uniform + self.background
@@ -90,14 +91,9 @@ class Spots:
 
 
 def find_spots(
-    images: Floats,
-    background: Floats,
-    model: SpotModel,
-    sigma: Floats,
-    magnification: Floats,
-    start: Spots | None = None,
-    progress: Progress | None = None,
-) -> Spots:
+    images: Floats, background: Floats, model: SpotModel, sigma: Floats, magnification: Floats,
+    start: Spots | None = None, progress: Progress | None = None,
+) -> Spots:  # fmt: skip
     """Find the spots in images (K, M, n_v, n_u) of one point source per acquisition, and the crystals' blur.
 
     Fisher's scoring, from the centroid of the brightest window, finds the maximum of the Poisson likelihood by centre,
@@ -123,13 +119,12 @@ def find_spots(
     """
     radii = model.hole_radius * (1 + magnification)
     pitch, size = np.abs(model.lattice.step), np.array(model.lattice.shape[::-1])
-    reach = (radii.max(axis=0) + 3 * sigma + model.parallax)[:, None] / pitch
+    parallax = model.thickness / 4 * np.abs(model.lattice.first).max(axis=1) / model.length
+    reach = (radii.max(axis=0) + 3 * sigma + parallax)[:, None] / pitch
     n_u, n_v = np.minimum(2 * (np.ceil(reach.max(axis=0)).astype(int) + _MARGIN) + 1, size)
-    cut = [
-        _cut_windows(x, np.broadcast_to(background, x.shape), model, r, (n_v, n_u))
-        for x, r in zip(images, radii, strict=True)
-    ]
-    seen, values, first, windows, known = (np.array(arrays) for arrays in zip(*cut, strict=True))
+    background = np.broadcast_to(background, images.shape)
+    cut = map(partial(_cut_windows, model, (n_v, n_u)), images, background, radii)
+    seen, values, first, windows, known = map(np.array, zip(*cut, strict=True))
     if start is not None:
         values = np.where((start.seen & seen)[..., None], start.values, values)
     nothing = np.zeros((*seen.shape, 3, 3)), first, windows, known, 0.0 * seen, 0.0 * seen
@@ -142,7 +137,7 @@ def find_spots(
 
 
 def _cut_windows(
-    counts: Floats, background: Floats, model: SpotModel, radii: Floats, shape: tuple[int, int]
+    model: SpotModel, shape: tuple[int, int], counts: Floats, background: Floats, radii: Floats
 ) -> tuple[Bools, Floats, Array, Floats, Floats]:
     """Return the first fields of `Spots` for the images `counts` (M, n_v, n_u) of one acquisition, in windows of `shape`.
 
@@ -182,7 +177,7 @@ def _maximize_likelihood(spots: Spots, n_first: int, progress: Progress | None) 
         floor = _MIN_BACKGROUND * values[..., 3] * pitch.prod(axis=1) / (np.pi * (radii**2 + 4 * spots.sigma**2))
         values[..., 4] = np.maximum(values[..., 4], floor)
         terms = (_normal_equations(spots, k, step < n_first) for k in range(len(values)))
-        slope, information, chi_square = (np.array(arrays) for arrays in zip(*terms, strict=True))
+        slope, information, chi_square = map(np.array, zip(*terms, strict=True))
         covariance = np.linalg.inv(information[..., :5, :5])
         along = (covariance @ information[..., :5, 5:])[..., 0]  # changes of the values by the blur's square
         score = slope[..., 5] - (along * slope[..., :5]).sum(axis=2)
@@ -215,7 +210,12 @@ def _normal_equations(spots: Spots, k: int, holds_radius: bool) -> tuple[Floats,
     """
     values, windows, known = spots.values[k], spots.windows[k], spots.background[k]
     fractions, gradient = spots.model.fractions(
-        values[:, :2], values[:, 2], spots.sigma, spots.magnification[k], known.shape[1:], spots.first[k]
+        values[:, :2],
+        values[:, 2],
+        spots.sigma,
+        spots.magnification[k],
+        (known.shape[1], known.shape[2]),
+        spots.first[k],
     )
     counts, uniform = values.T[3:, :, None, None]
     expected = counts * fractions + uniform + known

@@ -14,7 +14,6 @@ from mphdrr.core.cli import main
 pytest.importorskip("scipy", reason="no scipy")
 
 from mphdrr.core.design.bundle import BundleAdjustment
-from mphdrr.core.design.point_images import quadrant_areas
 from mphdrr.core.geometry.frames import affine_matrix
 
 SHAPE = (48, 48)
@@ -76,26 +75,6 @@ class Measured:
 def some(scanner):
     """Return ten modules of the four rings."""
     return scanner[::8]
-
-
-def test_areas_of_discs_and_their_derivatives(rng):
-    u, v, radii = rng.uniform(-2, 2, (4, 9)), rng.uniform(-2, 2, (4, 7)), rng.uniform(0.3, 1.7, 4)
-    areas, *slopes = quadrant_areas(u, v, radii)
-    step = 1e-6
-    for slope, along in zip(slopes, np.eye(3), strict=True):
-        ends = [
-            quadrant_areas(*(x + s * step * d for x, d in zip((u, v, radii), along, strict=True)))[0] for s in (1, -1)
-        ]
-        assert np.allclose((ends[0] - ends[1]) / (2 * step), slope, atol=1e-7)
-    grid = (
-        np.stack(np.meshgrid(*[np.linspace(-2, 2, 401)] * 2, indexing="ij"), axis=-1)[:-1, :-1].reshape(-1, 2) + 1 / 200
-    )
-    for s in range(4):
-        inside = (grid**2).sum(axis=1) < radii[s] ** 2
-        counted = (inside & (grid[:, 0] < u[s, 0]) & (grid[:, 1] < v[s, 0])).sum()
-        assert areas[s, 0, 0] == pytest.approx(counted / 100**2, abs=0.02)
-    whole = quadrant_areas(np.full((4, 1), 9.0), np.full((4, 1), 9.0), radii)[0]
-    assert np.allclose(whole.ravel(), np.pi * radii**2)
 
 
 @pytest.mark.parametrize("detector", ["virtual", "real"])

@@ -9,7 +9,6 @@ from typing import Any
 import bpy
 
 from ..core.physics.maps import MAPS
-from ..core.xray.dose import decays
 from . import spect_ct
 from .events import event_notes
 from .preferences import website
@@ -104,10 +103,10 @@ def _shown_run(scene: bpy.types.Scene) -> bpy.types.PropertyGroup | None:
 
 
 def _is_without_dose(scene: bpy.types.Scene) -> bool:
-    """Return whether a dose map is due: SPECT beside X-ray tubes of an isotope with known dose, and no dose map yet."""
+    """Return whether a dose map is due: SPECT of an isotope beside X-ray tubes, and no dose map yet."""
     has_tubes = not all(map(scanner.sees_activity, scanner.scanners(scene)))
     has_dose = any(volumes.quantity_of(item) == "dose_rate" for item in volumes.volume_objects(scene))
-    return has_tubes and not has_dose and runs.run_settings(scene).get("model.isotope") in decays()
+    return has_tubes and not has_dose and runs.run_settings(scene).get("model.isotope") is not None
 
 
 def _scene_changes(scene: bpy.types.Scene) -> list[str]:

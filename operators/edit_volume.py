@@ -8,7 +8,7 @@ from ..addon.blender import choices, decimals, jobs, storage
 from ..addon.blender.reports import Reported, ask_to_remove, needs
 from ..addon.volumes import slices, volume_import, volume_materials, volumes
 from ..core.errors import InputError
-from ..core.xray.dose import decays
+from ..core.physics.isotopes import ISOTOPES
 
 
 class MPHDRR_OT_add_slices(Reported, bpy.types.Operator):
@@ -64,7 +64,7 @@ class MPHDRR_OT_add_dose_map(jobs.JobOperator, bpy.types.Operator):
     """Make a volume of the absorbed dose rate (mGy/h) from the active volume of activity, as in water of density 1."""
 
     isotope: EnumProperty(name="Isotope", description="Isotope that decays",
-                          items=choices.items({}, ((name, name, "") for name in decays())),
+                          items=choices.items({}, ((name, name, "") for name in ISOTOPES)),
                           default="Tc-99m")  # fmt: skip
 
     poll = needs((_is_activity, "No activity is active: select a volume of activity"))

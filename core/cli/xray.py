@@ -6,7 +6,6 @@ import numpy as np
 
 from ... import core as mph
 from ..volumes.volume_files import VOLUME_FORMATS
-from ..xray.dose import decays
 from .options import add_actions, add_run, describe_volume, output_path, print_answer
 from .scanners import add_workbook
 
@@ -32,7 +31,7 @@ def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
     dose = add_run(actions, "dose", _dose)
     add = dose.add_argument
     add("activity", metavar="VOLUME", help="activity, kBq/mL")
-    add("--isotope", required=True, choices=tuple(decays()), help="isotope of the activity")
+    add("--isotope", required=True, choices=tuple(mph.ISOTOPES), help="isotope of the activity")
     add("--ct", metavar="VOLUME", help="CT numbers, for the density 1 + HU / 1000 g/cm^3; default: water everywhere")
     add("--biological-half-life", type=float, metavar="H", help="hours; default: no biological elimination")
     add("--rate", action="store_true", help="write the initial dose rate, mGy/h, instead of the dose, mGy")

@@ -67,7 +67,7 @@ class ModelContents:
     fixed: Mapping[str, Any]  # the network's keyword-only arguments, by `Network.fixed`
     counts: Sequence[float]  # fewest and most counts of a scan of the training data
     trained_on: Mapping[str, Any]
-    """Training data: events by their recipes' hashes; name of the set, hash, model, levels, number of samples."""
+    """Training data: events by their recipes' hashes, and their truths; name of the set, hash, model, levels, samples."""
     curve: Sequence[Mapping[str, float]]  # learning curve
     judgement: Mapping[str, Any] | None = None  # the judge's record, if the network was judged
     versions: Mapping[str, str] = field(default_factory=versions)
@@ -208,9 +208,8 @@ class TrainedNetwork:
             with recorded_warnings():
                 return self(run, ("scanner", "physics"))
 
-        return JudgedMethod(
-            name, volume, self.fingerprint, self.contents.trained_on["events"], lambda: self._last_setup[-1].saved
-        )
+        trained_on, truths = self.contents.trained_on["events"], self.contents.trained_on.get("truths", ())
+        return JudgedMethod(name, volume, self.fingerprint, trained_on, lambda: self._last_setup[-1].saved, truths)
 
     def setup(self, A: Projector) -> ScannerSetup:
         """Return the setup of a projector, cached for later scans by the same scanner and for other networks."""

@@ -30,7 +30,7 @@ from ..errors import InputError, first_line, naming, reading
 from ..files import AnyPath, ensure_folder, read_text, require_ending, write_bytes
 from ..progress import Progress, Stages
 from .data import Samples, Source, prepare_samples
-from .judging.sets import events_by_recipe, set_fingerprint
+from .judging.sets import events_by_recipe, set_fingerprint, truths_of
 from .model_file import ModelContents, TrainedNetwork, read_model, write_model
 from .networks import NETWORKS
 from .recipe import OPTIMIZERS, TrainingRecipe
@@ -328,8 +328,8 @@ def _model_contents(recipe: TrainingRecipe, source: Source, samples: Samples, la
         fixed=network.fixed(setup),
         counts=(min(counts), max(counts)),
         trained_on={
-            "events": events_by_recipe(events), "set": set_fingerprint(events), "samples": source.fingerprint,
-            "model": source.model, "levels": list(source.levels), "count": len(samples),
+            "events": events_by_recipe(events), "truths": sorted({*truths_of(events)}), "set": set_fingerprint(events),
+            "samples": source.fingerprint, "model": source.model, "levels": list(source.levels), "count": len(samples),
         },
         curve=checkpoint["curve"],
     )  # fmt: skip

@@ -152,8 +152,15 @@ class Model(ABC):
         """Return the model for backends that know rays alone; raise `InputError` if it must not be computed by rays."""
         return self
 
-    def response(self, views: Views, m: int) -> tuple[Floats, Floats] | None:
-        """Return the detector's response in view m, matrices (n_v, n_v) along v and (n_u, n_u) along u; None if ideal."""
+    def pixel_parts(self, views: Views, grid: Grid) -> int:
+        """Return the number of parts along a pixel's side whose means `response` needs."""
+        return 1
+
+    def response(self, views: Views, m: int, parts: int) -> tuple[Floats, Floats] | None:
+        """Return the detector's response in view m, from the means of pixels' parts to pixels; None if it is ideal.
+
+        It is a matrix (n_v, n_v parts) along v, and one (n_u, n_u parts) along u.
+        """
         return None
 
 

@@ -159,9 +159,13 @@ class ThroughWalls(Model):
         """Raise `InputError` unless `views` are of the modules."""
         self.model.check(views)
 
-    def response(self, views: Views, m: int) -> Any:
+    def pixel_parts(self, views: Views, grid: Grid) -> int:
+        """Return the number of parts along a pixel's side that the response of `model` needs."""
+        return self.model.pixel_parts(views, grid)
+
+    def response(self, views: Views, m: int, parts: int) -> Any:
         """Return the detector's response of `model` in view m."""
-        return self.model.response(views, m)
+        return self.model.response(views, m, parts)
 
     def beams(self, views: Views, m: int, grid: Grid) -> Iterator[Beam]:
         """Yield rays from points of the hole, or of the plane beside it, through the grid, with their weights."""

@@ -4,10 +4,9 @@
 point, `pixel_weights` of a pixel); `sensitivity` and `resolution` (performance.py) evaluate it at points,
 `sensitivity_map` and others (maps.py) on a grid.
 
-- An isotope is a line in isotopes.txt, a material a line in materials.txt (and its name in `APERTURES` or `CRYSTALS` of
-  materials.py, if it is offered for these); names, menus and help texts follow. For a dose, an isotope also needs a line
-  in `core/xray/decays.txt`. tests/core/test_emission.py compares each isotope with another evaluation, and wants its
-  numbers.
+- An isotope is a line in isotopes.txt, whose radiations `tools/photon_lines.py` writes from name and half-life, a material
+  a line in materials.txt (and its name in `APERTURES` or `CRYSTALS` of materials.py, if it is offered for these); names,
+  menus and help texts follow. tests/core/test_emission.py compares each isotope with ICRP 107, and wants its numbers.
 - A noise model is a function like `draw_poisson` and a row of `NOISE_MODELS` (noise.py); with a second row the choice is
   the setting ``noise.model`` of recipes, commands and event sets; the window's panel draws Poisson noise.
 - A map is a function in maps.py that returns a `Volume`, with a line in `MAPS` and a number in

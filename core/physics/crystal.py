@@ -58,10 +58,41 @@ def share_inside(middle: ArrayOrTensor, size: ArrayOrTensor, side: ArrayOrTensor
     return (last - first).clip(min=0) / size
 
 
-def gaussian_blur(n: int, sigma: float) -> Floats:
-    """Return the matrix (n, n) that blurs n pixels with a Gaussian of `sigma` pixels, integrated over the blurred pixels."""
+def gaussian_blur(n: int, sigma: float, parts: int = 1) -> Floats:
+    """Return the matrix (n, n parts) that blurs pixel means with a Gaussian of `sigma` pixels.
+
+    It takes the means of the `parts` of each of n pixels, and returns those of the pixels. The means hold the pixels' box
+    already, so the Gaussian is sampled, not integrated; the variance that small ones lack is added by one step of diffusion.
+    """
+    width = sigma * parts
+    distance = np.arange(-n * parts, n * parts + 1)
+    reach = math.ceil(8 * width) + 1  # beyond it float64 has nothing
+    squares = np.arange(-reach, reach + 1) ** 2
+    scale = -0.5 / max(width, 1e-3) ** 2
+    total = np.exp(scale * squares).sum()
+    missing = (width**2 - squares @ np.exp(scale * squares) / total) / 2
+    sampled = np.where(abs(distance) <= reach, np.exp(scale * distance**2) / total, 0)
+    kernel = np.convolve(sampled, [missing, 1 - 2 * missing, missing], "same")
+    over_pixel = np.convolve(kernel, np.ones(parts))
+    return over_pixel[n * parts + np.arange(n)[:, None] * parts + parts - 1 - np.arange(n * parts)]
+
+
+def point_blur(n: int, sigma: float) -> Floats:
+    """Return the matrix (n, n) from values at the centres of n pixels to their means, blurred by `sigma` pixels."""
     with np.errstate(divide="ignore"):  # a sigma of 0, no blur, gives 1 on the diagonal
         edges = (np.arange(n + 1) - 0.5) / (sigma * math.sqrt(2))
     kernel = np.diff([0.5 * math.erf(x) for x in edges])
-    distance = np.abs(np.arange(n)[:, None] - np.arange(n))
-    return kernel[distance]
+    return kernel[np.abs(np.arange(n)[:, None] - np.arange(n))]
+
+
+def parts_for_blur(sigma: float, width: float) -> int:
+    """Return the number of parts of a pixel's side to blur apart, so that at most 0.3 % of the counts are misplaced.
+
+    Means over whole pixels no longer say where in a pixel an edge was. `sigma` is the blur's standard deviation and `width`
+    the width of an unblurred point's image, a disc, both in pixels. The law was fitted to images of such discs.
+    """
+    if sigma**1.5 < 0.003 * width:
+        return 1
+    variance = width**2 / 16 + sigma**2 + 1 / 12
+    misplaced, widened = 3.3 / (sigma**0.4 * width**0.55) - 0.5, (15 / (width**0.5 * variance)) ** 0.4
+    return min(max(math.ceil(max(misplaced, widened)), 2 if sigma < 0.7 else 1), 10)

@@ -1,4 +1,4 @@
-"""Isotopes of nuclear medicine, their half-lives and photon lines, from the table in isotopes.txt."""
+"""Isotopes of nuclear medicine, their half-lives and radiations, from the table in isotopes.txt."""
 
 import math
 from dataclasses import dataclass
@@ -20,11 +20,14 @@ Window = tuple[float, float]
 
 @dataclass(frozen=True)
 class Isotope:
-    """Isotope with the photons that are used to image it."""
+    """Isotope with the photons that are used to image it, and the other energy that its decays set free."""
 
     name: str  # name such as "Tc-99m"
     half_life: float  # s
     lines: tuple[Line, ...]  # photon lines, in order of energy
+    weak_lines: tuple[Line, ...] = ()  # photon lines that are not counted, in order of energy
+    electrons: float = 0.0  # mean energy of electrons, keV per decay
+    soft_photons: float = 0.0  # mean energy of photons below 10 keV, which end where they begin, keV per decay
 
     @property
     def window(self) -> Window:
@@ -57,10 +60,17 @@ class Isotope:
 
 
 def _read(line: str) -> Isotope:
-    """Read a line of the table: name, half-life and its unit, then energy and photons per decay of each photon line."""
-    name, half_life, unit, *numbers = line.split()
-    energies, photons = map(float, numbers[::2]), map(float, numbers[1::2])
-    return Isotope(name, float(half_life) * _SECONDS[unit], tuple(zip(energies, photons, strict=True)))
+    """Read a line of the table: name, half-life and its unit, energies per decay, then photon lines, and weak ones."""
+    strong, _, weak = line.partition("weak")
+    name, half_life, unit, electrons, soft, *numbers = strong.split()
+    return Isotope(
+        name, float(half_life) * _SECONDS[unit], _lines(numbers), _lines(weak.split()), float(electrons), float(soft)
+    )
+
+
+def _lines(words: list[str]) -> tuple[Line, ...]:
+    """Return photon lines from their energies and photons per decay in turn."""
+    return tuple((float(energy), float(photons)) for energy, photons in zip(words[::2], words[1::2], strict=True))
 
 
 ISOTOPES = {isotope.name: isotope for isotope in map(_read, table_lines("isotopes.txt"))}

@@ -99,7 +99,7 @@ def geometry_gradient(A: Projector, volume: Volume | Floats | Floats32, images: 
     signs = np.sign([np.einsum("mi,mi->m", s, a) for s, a in ((A.views.v_steps, v), (A.views.u_steps, u))]).T
     diameter = numbers["diameter"] * _d_effective_diameter(model)
     pitch, offset = ((numbers[name] * signs)[:, ::-1] for name in ("pitch", "first"))
-    pitch = pitch + sum(map(partial(_pitch_gradient_of_blur, A, pinholes), volumes, batch))
+    pitch = pitch / A._pixel_parts + sum(map(partial(_pitch_gradient_of_blur, A, pinholes), volumes, batch))
     return GeometryGradient(centers, frames, numbers["length"], diameter, pitch, offset)
 
 
@@ -116,12 +116,12 @@ def _pitch_gradient_of_blur(A: Projector, pinholes: PinholeOperator, volume: Arr
     gradient, views = np.zeros((len(images), 2)), A.views
     model: Any = A.model
     images = images * with_image_axes(model.efficiency)
-    if model.response(views, 0) is None:
+    if model.response(views, 0, A._pixel_parts) is None:
         return gradient
     scales = 1 + _STEP, 1 - _STEP
     wide, narrow = (replace(views, u_steps=a * views.u_steps, v_steps=a * views.v_steps) for a in scales)
     for m, image in enumerate(pinholes.images(volume, *A._pinhole_arguments(volume)[1:], None)):
-        (v, u), upper, lower = (model.response(scaled, m) for scaled in (views, wide, narrow))
+        (v, u), upper, lower = (model.response(scaled, m, A._pixel_parts) for scaled in (views, wide, narrow))
         d_v, d_u = ((a - b) / (2 * _STEP) for a, b in zip(upper, lower, strict=True))
         pitch = model.crystal_pitch(views, m)
         gradient[m, 0] = (images[m] * (v @ image @ d_u.T)).sum() / pitch[0]

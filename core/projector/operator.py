@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import functools
+import math
 from collections.abc import Iterator
 from typing import Any
 
@@ -127,15 +128,20 @@ class Projector(LinearOperator):
             model = model.by_rays()
         self.model = model
         model.check(views)
-        for text in _warnings(grid, views, model):
-            warn(text, 2)
         self.threads = thread_count(threads)
         self.which = freeze(np.arange(len(views)))
-        self._bundles = Bundles(len(views), self._bundle)
         parts = model.parts()
         with recorded_warnings():  # they are those of this projector
             self._parts = [Projector(grid, views, part, **self._settings) for part in parts if part is not model]
-        self._pinholes = None if self._parts else model.by_depth(views, grid)
+        self._set_pixel_parts(model.pixel_parts(views, grid))
+        for text in _warnings(grid, self._fine_views, model):
+            warn(text, 2)
+
+    def _set_pixel_parts(self, n: int) -> None:
+        """Compute images with `n` parts along a pixel's side, whose means the detector's response takes."""
+        self._pixel_parts, self._fine_views = n, self.views if n == 1 else self.views.finer(n)
+        self._bundles = Bundles(len(self.views), self._bundle)
+        self._pinholes = None if self._parts else self.model.by_depth(self._fine_views, self.grid)
 
     @uncompiled
     def __call__(
@@ -239,6 +245,9 @@ class Projector(LinearOperator):
                 subset = self.grid, self.views[indices], self.model.of_views(indices)
                 projectors.append(copy.copy(self) if n == 1 else Projector(*subset, **self._settings))
                 projectors[-1].which = freeze(indices)
+                for part, whole in zip((projectors[-1], *projectors[-1]._parts), (self, *self._parts), strict=True):
+                    if part._pixel_parts != whole._pixel_parts:  # its images are those of the whole
+                        part._set_pixel_parts(whole._pixel_parts)
         return projectors
 
     def __repr__(self) -> str:
@@ -284,7 +293,8 @@ class Projector(LinearOperator):
             return sum(A._run_back(y, part_of(progress, k, n), mu) for k, A in enumerate(self._parts))
         execution = self._execution(y)
         detected = execution.to_backend(y)
-        n_bytes = detected.itemsize * self.grid.n_voxels + self._extra_bytes(detected.itemsize)
+        n_bytes = detected.itemsize * (self.grid.n_voxels + len(self.views) * math.prod(self._fine_views.shape))
+        n_bytes += self._extra_bytes(detected.itemsize)
         self._require(n_bytes, f"the adjoint into {shape_text(self.grid.shape)} voxels")
         self._require_rays()
         n = len(self.views)
@@ -313,7 +323,7 @@ class Projector(LinearOperator):
         self._require_rays()
         execution = self._execution(x)
         for m, image in enumerate(self._plain_images(execution, x, mu)):
-            if (response := self.model.response(self.views, m)) is not None:
+            if (response := self.model.response(self.views, m, self._pixel_parts)) is not None:
                 along_v, along_u = (cast_like(matrix, image) for matrix in response)
                 image = along_v @ image @ along_u.T
             if self._efficiency is not None:  # the projectors of close voxels have their own
@@ -361,18 +371,19 @@ class Projector(LinearOperator):
         """Return the adjoint of the detector's response and efficiency for `images` (M, n_v, n_u)."""
         if self._efficiency is not None:
             images = images * cast_like(self._efficiency, images)
+        result = images
         for m in range(len(self.views)):
-            if (response := self.model.response(self.views, m)) is None:
+            if (response := self.model.response(self.views, m, self._pixel_parts)) is None:
                 return images
             if m == 0:
-                images = images + 0  # a copy: the caller's images stay as they are
+                result = zeros((len(self.views), *self._fine_views.shape), images)
             along_v, along_u = (cast_like(matrix, images) for matrix in response)
-            images[m] = along_v.T @ images[m] @ along_u
-        return images
+            result[m] = along_v.T @ images[m] @ along_u
+        return result
 
     def _bundle(self, m: int) -> RayBundle:
         """Return the rays of view m."""
-        return RayBundle.along(self.grid, *self.model.beams(self.views, m, self.grid))
+        return RayBundle.along(self.grid, *self.model.beams(self._fine_views, m, self.grid))
 
     def _execution(self, x: ArrayOrTensor) -> Execution:
         """Return the execution that traces the rays, for arrays or tensors such as `x`."""
@@ -433,7 +444,7 @@ class Projector(LinearOperator):
 
     def _require_rays(self) -> None:
         """Raise `InputError` if there is too little memory for an image and its rays."""
-        n_v, n_u = self.views.shape
+        n_v, n_u = self._fine_views.shape
         # An image of float32, and some arrays of float64 from which the weights of its rays are made.
         self._require(110 * n_v * n_u, f"an image of {n_v} x {n_u} pixels, with its rays,")
 

@@ -167,8 +167,8 @@ def emission_images(
     """Return the expected counts (..., n_v, n_u) of pinhole cameras, by the law of `Emission`.
 
     They are differentiable by the volume, by mu, and by all numbers of the cameras. Images are upright, as on a virtual
-    detector of magnification 1: those of a real detector are point-inverted. For an intrinsic blur multiply them by the
-    matrices of `gaussian_blur`.
+    detector of magnification 1: those of a real detector are point-inverted. For an intrinsic blur take whole
+    parts of the pixels, and multiply the images by the matrices of `gaussian_blur`.
 
     Parameters
     ----------

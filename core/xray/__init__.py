@@ -10,7 +10,6 @@ volume) and `absorbed_dose_rate` (dose of an activity).
 - A column of the sheet X-ray is a row of `XRAY_COLUMNS` in system.py.
 - An arrangement of sources is a function in arrangements.py; its options are in `core/cli/geometry/generate.py`, its
   settings in the window in `operators/xray.py`.
-- An isotope for dose is a line in decays.txt: energies per decay of ICRP 107. The tube spectra are a table that
-  `tools/tube_spectra.py` makes with SpekPy.
+- The tube spectra are a table that `tools/tube_spectra.py` makes with SpekPy.
 - A mechanical check is a `Finding` and its search in checks.py (`find_in_room`).
 """

@@ -134,7 +134,7 @@ class SpectralScan(Model):
         paths = np.stack([np.asarray(A(array, part_of(progress, i, n))) for i, array in enumerate(volumes)])
         images = np.empty(A.shape_out, np.float32)
         for views, m in self.transmissions(A.views):
-            images[views] = m.images(paths[:, views], self.system.mas[views])[0]
+            images[views] = m.images(paths[:, views], self.system.mas[views], A)[0]
         return images
 
     def line_integrals(self, images: ArrayLike, views: Views, corrected: bool = True) -> Floats32:

@@ -1,7 +1,7 @@
 """Polychromatic transmission: expected counts of a spectrum behind materials, and their derivatives by the paths."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
@@ -9,7 +9,7 @@ from ..arrays import Array, ArrayLike, Floats
 from ..errors import InputError
 from ..geometry.scanner import Scanner
 from ..geometry.views import Views
-from ..physics.crystal import gaussian_blur
+from ..physics.crystal import gaussian_blur, point_blur
 from ..physics.ct_numbers import CT_ENERGY
 from ..physics.energy_window import FWHM_PER_SIGMA
 from ..projector import Projector
@@ -88,7 +88,7 @@ class SpectralTransmission:
         self.weights = freeze(weights)
         self.mu = freeze(np.array([attenuations(name, spectrum.energies) for name in self.materials]))
         self._pixels = None if self.views is None else _pixel_factors(self.views)
-        self._blurs = _blur_matrices(self.views, none_below_0(blur, "blur")) if np.any(blur) else []
+        self._sigmas = _sigmas(self.views, none_below_0(blur, "blur")) if np.any(blur) else []
         self.background = freeze(none_below_0(background, "background"))
 
     def expected(self, paths: ArrayLike, mAs: ArrayLike) -> Floats:
@@ -125,12 +125,15 @@ class SpectralTransmission:
 
         `A` is the `Projector` from the volumes' grid to these views; its line integrals of the volumes are the paths.
         """
-        return self.images(self._paths(volumes, A), mAs)
+        return self.images(self._paths(volumes, A), mAs, A)
 
-    def images(self, paths: ArrayLike, mAs: ArrayLike) -> Floats:
-        """Return expected counts (bins, M, n_v, n_u) for paths (materials, M, n_v, n_u), with blur and background."""
+    def images(self, paths: ArrayLike, mAs: ArrayLike, A: Projector | None = None) -> Floats:
+        """Return expected counts (bins, M, n_v, n_u) for paths (materials, M, n_v, n_u), with blur and background.
+
+        The paths are those to the pixels' centres, unless they are from a projector `A` that takes means over pixels.
+        """
         counts = self.expected(paths, mAs)
-        for m, (along_v, along_u) in enumerate(self._blurs):
+        for m, (along_v, along_u) in enumerate(self._blurs(A)):
             counts[:, m] = along_v @ counts[:, m] @ along_u.T
         return counts + self.background
 
@@ -142,7 +145,7 @@ class SpectralTransmission:
         `values` are (bins, M, n_v, n_u).
         """
         values = np.array(values, np.float64)
-        for m, (along_v, along_u) in enumerate(self._blurs):
+        for m, (along_v, along_u) in enumerate(self._blurs(A)):
             values[:, m] = along_v.T @ values[:, m] @ along_u
         return np.stack([A.T(path) for path in self.gradient(self._paths(volumes, A), values, mAs)])
 
@@ -164,6 +167,12 @@ class SpectralTransmission:
         n = len(self.weights)
         sums = self._sums(paths, np.concatenate([self.weights, self._derivative_weights()])) * scale
         return sums[:n], sums[n:].reshape(n, *paths.shape)
+
+    def _blurs(self, A: Projector | None) -> Iterator[tuple[Floats, Floats]]:
+        """Yield, for each view, the matrices that blur its images of the paths of `A` along v and along u."""
+        matrix = point_blur if getattr(getattr(A, "model", None), "pixel_points", 1) == 1 else gaussian_blur
+        for v, u in self._sigmas:
+            yield matrix(self.views.shape[0], v), matrix(self.views.shape[1], u)  # type: ignore[union-attr]
 
     def _derivative_weights(self) -> Floats:
         """Return the weights (bins * materials, n) of the derivatives by the paths: ``-mu weights``."""
@@ -207,17 +216,12 @@ def panel_blur(system: XraySystem, fwhm: float = 0.0) -> Floats:
     return np.hypot(at_least_0(fwhm, "fwhm"), np.maximum(shadow, 0) * FWHM_PER_SIGMA / math.sqrt(12))
 
 
-def _blur_matrices(views: Views | None, blur: Floats) -> list[tuple[Floats, Floats]]:
-    """Return, for each view, the matrices that blur its images along v and along u."""
+def _sigmas(views: Views | None, blur: Floats) -> list[tuple[float, float]]:
+    """Return, for each view, the standard deviations of its blur along v and along u, pixels."""
     if views is None or blur.shape not in ((), (len(views),)):
         raise InputError("blur: expected one number, or one of each view, and views")
-    sigmas = np.broadcast_to(blur / FWHM_PER_SIGMA, len(views))
     steps = np.linalg.norm([views.v_steps, views.u_steps], axis=2)
-    along_v, along_u = (
-        [gaussian_blur(n, sigma / step) for sigma, step in zip(sigmas, view_steps, strict=True)]
-        for n, view_steps in zip(views.shape, steps, strict=True)
-    )
-    return list(zip(along_v, along_u, strict=True))
+    return list(zip(*(blur / FWHM_PER_SIGMA / steps).tolist(), strict=True))
 
 
 def _pixel_factors(views: Views) -> Floats:

@@ -125,12 +125,14 @@ def test_images_are_those_of_the_projector(backend, which, system, rng):
     same = {"time": 20.0, "photons_per_decay": 0.9, "aperture_points": 4, "pixel_points": 1, "crystal_mu": 0.1}
     model = emission(system, mu, aperture_mu=3.0, intrinsic_fwhm=0.8, **same)
     poses = torch.tensor(system.poses())
+    parts = model.pixel_parts(system.views((9, 8), "real", pitch=(0.4, 0.6), offset=(-0.1, 0.2)), grid)
     got = emission_images(
-        activity, poses[:, :3, 3], poses[:, :3, :3], torch.tensor(system.collimator_length), [0.4, 0.6], (9, 8), [0.1, -0.2],
+        activity, poses[:, :3, 3], poses[:, :3, :3], torch.tensor(system.collimator_length),
+        [0.4 / parts, 0.6 / parts], (9 * parts, 8 * parts), [0.1, -0.2],
         diameter=torch.tensor(model.effective_diameter), crystal_thickness=torch.tensor(system.detector_thickness),
         mu=mu, backend=backend, **same,
     ).numpy()  # fmt: skip
-    along_v, along_u = (gaussian_blur(n, 0.8 / 2.35482 / pitch) for n, pitch in ((9, 0.6), (8, 0.4)))
+    along_v, along_u = (gaussian_blur(n, 0.8 / 2.35482 / pitch, parts) for n, pitch in ((9, 0.6), (8, 0.4)))
     got = along_v @ got @ along_u.T
     virtual = system.views((9, 8), "virtual", 10.0, pitch=(4.0, 6.0), offset=(1.0, -2.0))
     real = system.views((9, 8), "real", pitch=(0.4, 0.6), offset=(-0.1, 0.2))

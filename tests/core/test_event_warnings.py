@@ -44,7 +44,7 @@ CASES = {
         TC | {"attenuation.file": "ct.npz", "attenuation.energy": 80.0}, "the mu of ct.npz holds at 80 keV",
     ),
     "mu at another isotope's": (
-        TC | {"attenuation.file": "ct.npz", "attenuation.energy": "Tl-201"}, "the mu of ct.npz holds at 70",
+        TC | {"attenuation.file": "ct.npz", "attenuation.energy": "Tl-201"}, "the mu of ct.npz holds at 71.07 keV",
     ),
     "the phantom's mu at another energy": (
         TC | {"model.isotope": "Tl-201", "phantom.kind": "derenzo", "attenuation.of_phantom": True}, "of the Derenzo",

@@ -10,11 +10,18 @@ from mphdrr.core.learning.judging.judge import judge
 from mphdrr.core.learning.judging.methods import Family, JudgedMethod, smooth, tune
 from mphdrr.core.learning.judging.recipe import read_judge_recipe
 from mphdrr.core.learning.judging.scoring import Case
-from mphdrr.core.learning.judging.sets import SETS, events_by_recipe, set_fingerprint, set_text
+from mphdrr.core.learning.judging.sets import (
+    SETS,
+    events_by_recipe,
+    refuse_trained_on,
+    set_fingerprint,
+    set_text,
+    truths_of,
+)
 from mphdrr.core.phantoms import painting, shapes
 
 from .conftest import WORKBOOK, refused
-from .small_events import TEXT, small_recipe
+from .small_events import TEXT, small_recipe, with_phantoms
 from .small_recipes import JUDGE
 
 RODS = TEXT[: TEXT.index('[[phantoms]]\nkind = "points"')] + TEXT[TEXT.index("[models.lines]") :]
@@ -189,6 +196,59 @@ def test_a_method_that_was_trained_on_the_test_is_refused(folder, tmp_path):
     assert set_fingerprint(events) != set_fingerprint(events[:2])
     other = JudgedMethod("net", halved, "net-1", events_by_recipe(mph.events.EventSet(folder / "validation")))
     assert judge(short_recipe(folder), tmp_path, [other]).rows
+
+
+def test_a_method_is_not_judged_on_the_truths_of_its_training_under_another_recipe(folder, tmp_path):
+    trained_on = mph.events.EventSet(folder / "rods")
+    truths = truths_of(trained_on[1:])
+    assert len({*truths_of(trained_on)}) == 3
+    for name, old, new, hits in (
+        ("time", "time = 100", "time = 99", "1, 2"),
+        ("seed", "seed = 5", "seed = 6", None),
+        ("scanner", 'modules = "1-4,21-24"', 'modules = "1-3"', "1, 2"),
+        ("voxels", "voxels = 16\nspacing = 6.0", "voxels = 12\nspacing = 8.0", "1, 2"),
+        ("activity", "[radon]", "[augmentation]\nactivity = 1.5\n[radon]", "1, 2"),
+        ("mirrored", "[radon]", "[augmentation]\nmirror = 1\n[radon]", None),
+        ("radius", "radius = { from = 30", "radius = { from = 31", None),
+        ("place", "from = -8", "from = -9", None),
+    ):
+        assert old in RODS
+        mph.events.make(small_recipe(tmp_path / f"{name}-recipe", RODS.replace(old, new)), tmp_path / name, 3)
+        events = mph.events.EventSet(tmp_path / name)
+        assert not {*events_by_recipe(events)} & {*events_by_recipe(trained_on)}
+
+        def check(events=events, name=name):
+            refuse_trained_on("net", events_by_recipe(trained_on), truths, events, name)
+
+        check() if hits is None else refused(check, f"net: it was trained on events of the test {name}: {hits}; judge")
+        refuse_trained_on("old", events_by_recipe(trained_on), (), events, name)  # of models without truths
+
+
+def test_volumes_are_the_same_truth_by_their_contents_whatever_their_files_are_called(tmp_path):
+    truths = []
+    for name, value in (("a", 1.0), ("b", 1.0), ("c", 2.0)):
+        folder = tmp_path / name
+        folder.mkdir()
+        volume = mph.Volume(np.full((4, 4, 4), value, np.float32), mph.Grid.centered(4, 10.0), "activity")
+        mph.write_volume(volume, folder / f"{name}.h5")
+        recipe = small_recipe(folder, with_phantoms(f'[[phantoms]]\nfile = "{name}.h5"\n'))
+        mph.events.make(recipe, folder / "set", 1)
+        truths += truths_of(mph.events.EventSet(folder / "set"))
+    assert truths[0] == truths[1] != truths[2]
+
+
+def test_the_judge_refuses_methods_and_baselines_that_know_the_truths_of_a_test(folder, tmp_path):
+    mph.events.make(small_recipe(tmp_path / "recipe", RODS.replace("time = 100", "time = 99")), tmp_path / "later", 3)
+    for name in ("rods", "validation"):
+        (tmp_path / name).symlink_to(folder / name)
+    later = (JUDGE + SHORT_TEST).replace('events = "rods"', 'events = "later"')
+    net = JudgedMethod("net", halved, "net-1", truths=truths_of(mph.events.EventSet(folder / "rods")))
+    for who, text, methods in (("net", later, [net]), ("baselines", later.replace('"validation"', '"rods"'), [])):
+        (tmp_path / "judge.toml").write_text(text)
+        recipe = read_judge_recipe(tmp_path / "judge.toml")
+        refused(
+            lambda recipe=recipe, methods=methods: judge(recipe, tmp_path / "out", methods), f"{who}: it was trained on"
+        )
 
 
 def test_a_test_that_names_models_judges_those_only(folder, tmp_path):

@@ -20,7 +20,7 @@ import mphdrr.core as mph
 from mphdrr.core.cli import main
 from mphdrr.core.events import EventSet
 from mphdrr.core.learning import model_file
-from mphdrr.core.learning.judging.sets import events_by_recipe
+from mphdrr.core.learning.judging.sets import events_by_recipe, truths_of
 from mphdrr.core.learning.model_file import read_model, seal, write_model
 from mphdrr.core.learning.networks import NETWORKS
 from mphdrr.core.reconstruction.methods import method_of
@@ -124,7 +124,9 @@ def test_weights_of_another_network_are_refused(model, tmp_path):
 
 def test_a_file_holds_what_the_network_was_trained_on_and_is_a_zip_for_torch(folder, model):
     contents, events = model.contents, EventSet(folder / "set")
-    assert contents.trained_on["events"] == events_by_recipe(events.split("train") + events.split("test"))
+    used = events.split("train") + events.split("test")
+    assert contents.trained_on["events"] == events_by_recipe(used)
+    assert {*contents.trained_on["truths"]} == {*truths_of(used)}
     assert contents.trained_on["levels"] == [1.0, 0.5] and contents.trained_on["model"] == "emission"
     assert contents.recipe == (folder / "training.toml").read_text(encoding="utf-8")
     assert contents.curve[-1]["step"] == 6 and {"mphdrr", "torch"} <= contents.versions.keys()
@@ -231,6 +233,9 @@ def test_the_command_line_reconstructs_with_a_model_and_says_so(folder, model, r
 def test_a_model_is_judged_under_a_name_without_warnings(model, run):
     method = model.judged("toy")
     assert method.name == "toy" and method.trained_on == model.contents.trained_on["events"]
+    assert method.truths == model.contents.trained_on["truths"]
+    before = {name: value for name, value in model.contents.trained_on.items() if name != "truths"}
+    assert replace(model, contents=replace(model.contents, trained_on=before)).judged("old").truths == ()
     assert method.function(with_fewer_modules(run)).grid == model.contents.grid
 
 
@@ -293,7 +298,10 @@ levels = [1.0, 0.5]
 def test_a_model_is_judged_by_the_command_beside_baselines_and_may_keep_its_rows(folder, model, tmp_path, capsys):
     (tmp_path / "net.pt").write_bytes((folder / "model.pt").read_bytes())
     (tmp_path / "set").symlink_to(folder / "set")
-    mph.events.make(small_recipe(tmp_path / "recipe", TEXT.replace("seed = 5", "seed = 6")), tmp_path / "others", 3)
+    others = TEXT.replace("seed = 5", "seed = 6").replace(
+        "odds = 0.5", "odds = 0"
+    )  # the points are the same in all sets
+    mph.events.make(small_recipe(tmp_path / "recipe", others), tmp_path / "others", 3)
     (tmp_path / "judge.toml").write_text(OWN_JUDGE, encoding="utf-8")
     command = ["learn", "judge", str(tmp_path / "judge.toml"), "-o", str(tmp_path / "judgement"), "--into-models"]
     assert main(command) == 0
@@ -302,7 +310,8 @@ def test_a_model_is_judged_by_the_command_beside_baselines_and_may_keep_its_rows
     net_rows = [row for row in rows if row["method"] == "net"]
     assert [row["level"] for row in net_rows] == [1.0, 0.5] and all(0 < row["nrmse"] < 1 for row in net_rows)
     assert mph.learning.read_model(tmp_path / "net.pt").contents.judgement["rows"] == net_rows
-    on_itself = OWN_JUDGE.replace('"others"\nlevels', '"set"\nsplit = "train"\nlevels')
+    on_itself = OWN_JUDGE.replace('"set"\nsplit = "test"', '"others"')
+    on_itself = on_itself.replace('"others"\nlevels', '"set"\nsplit = "train"\nlevels')
     (tmp_path / "judge.toml").write_text(on_itself, encoding="utf-8")
     assert main(command) == 1
     assert "net: it was trained on events of the test others" in capsys.readouterr().err

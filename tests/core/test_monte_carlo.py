@@ -315,7 +315,7 @@ def test_options(scanner, tmp_path) -> None:
     assert macros.values("/gate/application/setTimeStop") == [["20", "s"]]
     assert macros.values("/gate/random/setEngineSeed") == [["77"]]
     low, high = (float(macros.values(f".*/energyFraming/{k}")[0][0]) for k in ("setMin", "setMax"))
-    assert (low, high) == pytest.approx((70.8 * 0.85, 70.8 * 1.15))
+    assert (low, high) == pytest.approx((71.07 * 0.85, 71.07 * 1.15))
     assert not macros.values(".*/spatialResolution/.*")
     assert macros.values("/gate/source/point/gps/pos/centre") == [["1", "2", "-3", "mm"]]
     photons = 3e6 * sum(p for _, p in mph.ISOTOPES["Tl-201"].lines)

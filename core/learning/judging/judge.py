@@ -22,7 +22,7 @@ from .recipe import JudgeRecipe, Test
 from .records import Records, read_json, write_json
 from .report import BASELINE, METHOD, ORACLE, Judgement, write_report
 from .scoring import Case, Scores, as_believed, common_defect, measure_cost
-from .sets import events_by_recipe, refuse_trained_on, set_fingerprint, short_hash
+from .sets import events_by_recipe, refuse_trained_on, set_fingerprint, short_hash, truths_of
 from .summary import compare_scores, mean_scores, row_notes
 
 Row = dict[str, Any]
@@ -76,13 +76,13 @@ class _JudgeRun:
     ) -> None:
         self.recipe, self.folder, self.progress = recipe, folder, progress
         self.validation, *self.tests = (_TestEvents(recipe, test) for test in (recipe.validation, *recipe.tests))
-        tuned_on = events_by_recipe(self.validation.events)
+        tuned_on, tuned_truths = events_by_recipe(self.validation.events), truths_of(self.validation.events)
         for test in self.tests:
-            refuse_trained_on("baselines", tuned_on, test.events, test.name)
+            refuse_trained_on("baselines", tuned_on, tuned_truths, test.events, test.name)
         self.methods_by_test = {test.name: _named_methods(test, methods) for test in self.tests}
         for test in self.tests:
             for method in self.methods_by_test[test.name]:
-                refuse_trained_on(method.name, method.trained_on, test.events, test.name)
+                refuse_trained_on(method.name, method.trained_on, method.truths, test.events, test.name)
         self.n_done, self.n_total = 0, sum(map(self._n_volumes, self.tests))
         self.tuning = read_json(folder / "tuning.json")
 

@@ -1,6 +1,6 @@
 """Judged methods, and baselines among them, which are tuned on validation data only."""
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import islice
 from typing import Any
@@ -36,6 +36,8 @@ class JudgedMethod:
     """Events of its training, in the form of `sets.events_by_recipe`."""
     saved: Callable[[], float] = float
     """Function that returns the seconds that the last volume saved by sharing another method's intermediate results."""
+    truths: Collection[str] = ()
+    """Truths of the events of its training, in the form of `sets.truths_of`."""
 
 
 @dataclass(frozen=True)

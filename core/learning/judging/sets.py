@@ -2,13 +2,13 @@
 
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
 from ...errors import InputError, several
-from ...events.event_set import EventSet
+from ...events.event_set import Event, EventSet
 from ...events.templates import with_workbook
 from ...example import EXAMPLE
 from ...files import AnyPath
@@ -53,9 +53,33 @@ def short_hash(record: Any) -> str:
     return hashlib.sha256(json.dumps(record, sort_keys=True).encode()).hexdigest()[:16]
 
 
-def refuse_trained_on(method: str, trained_on: Mapping[str, list[int]], events: EventSet, name: str) -> None:
-    """Raise `InputError` if a method was trained on events of a test; `trained_on` is in the form of `events_by_recipe`."""
-    tests = events_by_recipe(events)
-    hits = [n for recipe, numbers in tests.items() for n in sorted({*numbers} & {*trained_on.get(recipe, ())})]
+def truths_of(events: EventSet) -> list[str]:
+    """Return a hash of each event's truth: phantom, with the contents of its files, gates, size, mirroring and pose.
+
+    It is the same whatever is measured of the truth: scanner, time, noise, voxels and `augmentation.activity` are left out.
+    """
+    return [_truth_hash(event) for event in events]
+
+
+def _truth_hash(event: Event) -> str:
+    """Return the hash of an event's truth, the placement rounded: its last digits differ between machines."""
+    planned = event.planned
+    files = [planned.recipe.input(name).sha256 for name in (planned.file, planned.mu_file) if name is not None]
+    phantom = [files, planned.entry["center"]] if files else event.settings
+    return short_hash([phantom, planned.entry["gates"], (planned.placement.round(6) + 0.0).tolist()])
+
+
+def refuse_trained_on(
+    method: str, trained_on: Mapping[str, list[int]], truths: Collection[str], events: EventSet, name: str
+) -> None:
+    """Raise `InputError` if a method was trained on events of a test, or on other events with their truths.
+
+    `trained_on` is in the form of `events_by_recipe`, and `truths` in that of `truths_of`; earlier models state none.
+    """
+    hashes = truths_of(events) if truths else [""] * len(events)
+    hits = [
+        event.number for event, truth in zip(events, hashes, strict=True)
+        if event.number in trained_on.get(event.recipe.fingerprint, ()) or truth in truths
+    ]  # fmt: skip
     if hits:
         raise InputError(f"{method}: it was trained on events of the test {name}: {several(hits)}; judge it on others")

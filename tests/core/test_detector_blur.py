@@ -1,0 +1,129 @@
+"""The detector's blur acts on photons before pixels count them; the truth is photons blurred on a continuous crystal."""
+
+import math
+
+import numpy as np
+import pytest
+
+import mphdrr.core as mph
+from mphdrr.core.physics.crystal import gaussian_blur, point_blur
+
+FWHM_PER_SIGMA = math.sqrt(8 * math.log(2))
+ERF = np.vectorize(math.erf)
+VOXEL = (5, 2, 6)
+
+
+@pytest.fixture(scope="module")
+def module():
+    return mph.read_system("examples/dc-spect-80.xlsx")[:1]
+
+
+def one_voxel(spacing):
+    grid = mph.Grid.centered((9, 9, 9), spacing=spacing)
+    x = np.zeros(grid.shape)
+    x[VOXEL] = 1.0
+    return grid, x
+
+
+def photons_in_pixels(system, n, grid, fwhm):
+    """Return the shares (n, n) of a voxel's photons in the pixels of a real detector, by quadrature over voxel and hole.
+
+    Each line through a point of the hole ends in a Gaussian on the crystal, whose integral over a pixel is a product of
+    differences of error functions.
+    """
+    (u, v, k), l, d = system.frames()[0], system.collimator_length[0], system.pinhole_diameter[0]
+    x, w = np.polynomial.legendre.leggauss(24)
+    angles = 2 * np.pi * np.arange(48) / 48
+    radii = d / 2 * np.sqrt((x + 1) / 2)
+    hole = np.stack([np.outer(radii, np.cos(angles)).ravel(), np.outer(radii, np.sin(angles)).ravel()])
+    x3, w3 = np.polynomial.legendre.leggauss(3)
+    places = np.stack(np.meshgrid(x3 / 2, x3 / 2, x3 / 2, indexing="ij"), -1).reshape(-1, 3) + VOXEL
+    points = places @ grid.affine[:3, :3].T + grid.affine[:3, 3] - system.centers[0]
+    along_u, along_v, h = points @ u, points @ v, points @ k
+    positions = [(a * l / h)[:, None] - b * (1 + l / h)[:, None] for a, b in zip((along_u, along_v), hole, strict=True)]
+    squared_slope = ((along_u[:, None] - hole[0]) ** 2 + (along_v[:, None] - hole[1]) ** 2) / h[:, None] ** 2
+    weights = np.einsum("i,j,k->ijk", w3, w3, w3).reshape(-1, 1) / h[:, None] ** 2 * (1 + squared_slope) ** -1.5
+    weights = (weights * np.repeat(w, 48)).ravel()
+    edges = (np.arange(n + 1) - n / 2) * system.detector_side[0] / n
+    scale = FWHM_PER_SIGMA / fwhm / math.sqrt(2)
+    ticks = np.linspace(-6, 6, 20_001)
+    steps = ERF(ticks)
+    in_u, in_v = (np.diff(np.interp(scale * (edges - p.reshape(-1, 1)), ticks, steps) / 2, axis=1) for p in positions)
+    return (in_v * weights[:, None]).T @ in_u / weights.sum()
+
+
+def upright(image, truth):
+    """Return the truth in the orientation of the image."""
+    turned = [truth[::a, ::b] for a in (1, -1) for b in (1, -1)]
+    return min(turned, key=lambda t: np.abs(image / image.sum() - t).sum())
+
+
+def variance(image):
+    profile = image.sum(axis=0) / image.sum()
+    places = np.arange(len(profile))
+    return profile @ places**2 - (profile @ places) ** 2
+
+
+CASES = [(16, 0.2), (16, 1.0), (32, 0.2), (32, 3.0), (64, 0.5), (64, 1.0), (64, 3.0), (64, 6.0), (128, 1.0), (256, 0.5)]
+
+
+@pytest.mark.parametrize(("n", "fwhm"), [*CASES, pytest.param(512, 0.2, marks=pytest.mark.long)])
+def test_photons_are_blurred_before_pixels_count_them(module, n, fwhm):
+    """Of a voxel's counts at most 0.3 % are in other pixels, and the image is as wide as that of the photons."""
+    grid, x = one_voxel(1.0)
+    A = mph.Projector(grid, module.views((n, n)), mph.Emission(module, intrinsic_fwhm=fwhm), double=True)
+    image = A(x)[0]
+    truth = upright(image, photons_in_pixels(module, n, grid, fwhm))
+    assert np.abs(image / image.sum() - truth / truth.sum()).sum() / 2 < 0.0015
+    assert variance(image) == pytest.approx(variance(truth), rel=1e-3)
+
+
+@pytest.mark.parametrize("hole", ["point", "rays"])
+@pytest.mark.parametrize(("n", "fwhm"), [(16, 1.0), (32, 0.2), (32, 3.0)])
+def test_by_rays_photons_are_blurred_before_pixels_count_them(module, hole, n, fwhm):
+    """The truth is the image without blur in pixels 1/16 as wide, blurred by differences of error functions."""
+    grid = mph.Grid.centered((21, 21, 21), spacing=1.0)
+    ball = 1.0 * (((np.indices(grid.shape) - 10) ** 2).sum(axis=0) <= 36)
+    options = {"hole": hole, **({"aperture_points": 19} if hole == "rays" else {})}
+    fine = 512
+    sharp = mph.Projector(grid, module.views((fine, fine)), mph.Emission(module, **options))(ball)[0]
+    blur = gaussian_of_positions(n, fine, module.detector_side[0], fwhm)
+    truth = blur @ sharp @ blur.T
+    image = mph.Projector(grid, module.views((n, n)), mph.Emission(module, intrinsic_fwhm=fwhm, **options))(ball)[0]
+    assert np.abs(image / image.sum() - truth / truth.sum()).sum() / 2 < 0.003
+    assert image.sum() == pytest.approx(truth.sum(), rel=1e-3)
+
+
+def gaussian_of_positions(n, fine, side, fwhm):
+    """Return the shares (n, fine) of photons at the centres of fine pixels that are recorded in each of n pixels."""
+    centres, edges = ((np.arange(fine) + 0.5) / fine - 0.5) * side, (np.arange(n + 1) / n - 0.5) * side
+    return np.diff(ERF((edges[:, None] - centres) * FWHM_PER_SIGMA / fwhm / math.sqrt(2)) / 2, axis=0)
+
+
+def test_subsets_have_the_images_of_the_whole():
+    """Modules with pixels of two sizes need different numbers of parts; a subset takes those of the whole."""
+    system = mph.read_system("examples/dc-spect-80.xlsx")[:4].replace(pinhole_diameter=[0.3, 0.3, 6.0, 6.0])
+    grid, x = one_voxel(4.0)
+    A = mph.Projector(grid, system.views((16, 16)), mph.Emission(system, intrinsic_fwhm=4.0), double=True)
+    for subset in A.subsets(4):
+        np.testing.assert_allclose(subset(x), A(x)[subset.which], rtol=1e-12)
+
+
+@pytest.mark.parametrize("parts", [1, 3])
+@pytest.mark.parametrize("sigma", [0.01, 0.2, 0.45, 0.7, 3.0])
+def test_a_blur_has_its_variance(sigma, parts):
+    """A row adds the blur's variance to a part's own, and keeps the counts; no weight is below 0."""
+    n = 61
+    matrix = gaussian_blur(n, sigma, parts)
+    places = (np.arange(n * parts) + 0.5) / parts - 0.5
+    row = matrix[n // 2]
+    assert row.sum() == pytest.approx(parts, rel=1e-12)
+    assert matrix.min() >= 0
+    within_pixel = (1 - 1 / parts**2) / 12  # of the parts of a pixel around its centre
+    assert row @ (places - n // 2) ** 2 / parts == pytest.approx(sigma**2 + within_pixel, rel=1e-3)
+
+
+def test_values_at_centres_become_means_of_pixels():
+    """Of a quadratic function, whose blurred mean is known."""
+    places = np.arange(61) - 30.0
+    assert point_blur(61, 2.0)[30] @ places**2 == pytest.approx(2.0**2 + 1 / 12, rel=1e-9)

@@ -59,10 +59,10 @@ class PixelLattice(NamedTuple):
 
 @dataclass(frozen=True)
 class SpotModel:
-    """What the modules make of a source: pixels, hole, crystal and the source's extent."""
+    """Physics of spots: the pixels, holes and crystals of M modules, and the extent of the source."""
 
     lattice: PixelLattice
-    """Pixels of M modules."""
+    """Pixels of the modules."""
     length: Floats
     """Collimator lengths (M,), mm."""
     hole_radius: Floats
@@ -86,7 +86,7 @@ class SpotModel:
             reach = one_for_all(model.optics.tangent / 2 / model.aperture_mu, "edge", n)  # type: ignore[operator]
         second = hole**4 / 4 + reach * (hole**3 + 3 * hole**2 * reach + 6 * hole * reach**2 + 6 * reach**3)
         radius = hole + reach if model.edge == "path" else model.effective_diameter / 2
-        edge_variance = second / (hole**2 + 2 * reach * (hole + reach)) - (hole + reach) ** 2 / 4
+        edge_variance = np.maximum(second / (hole**2 + 2 * reach * (hole + reach)) - (hole + reach) ** 2 / 4, 0.0)
         depth = system.detector_thickness * (model.depth_layers > 1)
         return cls(PixelLattice.from_views(model, views), system.collimator_length, radius, edge_variance, variance,
                    one_for_all(0.0 if model.optics.crystal_mu is None else model.optics.crystal_mu, "crystal_mu", n),

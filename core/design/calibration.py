@@ -240,12 +240,11 @@ def calibrate(
     whitening = np.linalg.inv(np.linalg.cholesky(covariance))
     length_sd = positive(distance_sd, "calibrate: distance_sd", "mm")
     measured = positions, whitening, spots.seen, pairs[:0], lengths[:0], length_sd
-    bundle = BundleAdjustment(system, start, True, further, prior_sd, *measured)
+    bundle, x = BundleAdjustment(system, start, True, further, prior_sd, *measured), None
     if points is not None or len(pairs):
-        bundle = _with_known_sources(bundle, points is not None, pairs, lengths)
-    spots = replace(spots, seen=bundle.used)
-    bundle, x = _fit_without_outliers(bundle)
-    return _make_result(views, bundle, x, spots)
+        bundle, x = _with_known_sources(bundle, points is not None, pairs, lengths)
+    spots = replace(spots, seen=spots.seen & bundle.used.any(axis=1, keepdims=True))
+    return _make_result(views, *_fit_without_outliers(bundle, x), spots)
 
 
 def _find_spots(
@@ -328,8 +327,10 @@ def _triangulate_points(system: PinholeSystem, positions: Floats, seen: Bools) -
     return points
 
 
-def _with_known_sources(free: BundleAdjustment, are_points: bool, pairs: Indexes, lengths: Floats) -> BundleAdjustment:
-    """Return the adjustment with the known `lengths` (D,), mm, of `pairs` (D, 2), or with its points as the known ones.
+def _with_known_sources(
+    free: BundleAdjustment, are_points: bool, pairs: Indexes, lengths: Floats
+) -> tuple[BundleAdjustment, Floats | None]:
+    """Return the adjustment with known `lengths` (D,), mm, of `pairs` (D, 2), or with known points, and a start of its x.
 
     Where two modules or more see each point, the fit without these, `free`, tells whether they are of another scale, and are
     then not used, and which of four points or three lengths are wrong. These are left out. All of it is warned of.
@@ -346,15 +347,18 @@ def _with_known_sources(free: BundleAdjustment, are_points: bool, pairs: Indexes
         groups, name = (pairs == np.arange(n_k)[:, None, None]).any(axis=2), "points"
         labels = [str(k + 1) for k in range(n_k)]
     if free.used.sum(axis=1).min() < 2:
-        return bundle
-    trial, x = _fit_without_outliers(free)
+        return bundle, None
+    x = free.start()
+    if are_points:  # near where the free fit ends, and found in no time
+        x[: bundle.start().size] = bundle.solve(bundle.start(), robust=True)
+    trial, x = _fit_without_outliers(free, x)
     fitted = np.linalg.norm(np.diff(trial.geometry(x).points[pairs], axis=1)[:, 0], axis=1)
     scale, modules = float(np.median(lengths / np.maximum(fitted, 1e-9))), trial.used.any(axis=0)
     scale_sd = free.sd[0] / (free.system.pinhole_distance[modules].mean() * math.sqrt(modules.sum()))
     if abs(scale - 1) > max(_MAX_SCALE, _FAR * scale_sd):
         fault = f"{scale:.3g} times as far apart as the nominal modules see them"
         warn(f"calibrate: {name}: they are {fault}, a scale; not used, the scale stays nominal")
-        return free
+        return trial, x
     errors = np.abs(lengths - scale * fitted)
     typical = np.array([np.median(errors[group]) for group in groups])
     is_wrong = typical > _FAR * max(free.distance_sd, 2 * float(np.median(typical)))
@@ -363,13 +367,16 @@ def _with_known_sources(free: BundleAdjustment, are_points: bool, pairs: Indexes
         texts = (f"{labels[i]}, {errors[groups[i]].max():.2f} mm off" for i in np.flatnonzero(is_wrong))
         warn(f"calibrate: {name}: {several(texts, 12)}, as the others and the images tell; left out")
     if are_points:
-        return replace(bundle, used=free.used & ~is_wrong[:, None])
-    return replace(bundle, pairs=pairs[~is_wrong], distances=lengths[~is_wrong])
+        return replace(bundle, used=trial.used & ~is_wrong[:, None]), x[: bundle.start().size]
+    return replace(bundle, pairs=pairs[~is_wrong], distances=lengths[~is_wrong], used=trial.used), x
 
 
-def _fit_without_outliers(bundle: BundleAdjustment) -> tuple[BundleAdjustment, Floats]:
-    """Solve the adjustment repeatedly, each time without further outliers; return it without them, and its solution x."""
-    x, robust = bundle.start(), True
+def _fit_without_outliers(bundle: BundleAdjustment, start: Floats | None = None) -> tuple[BundleAdjustment, Floats]:
+    """Solve the adjustment repeatedly, each time without further outliers; return it without them, and its solution x.
+
+    `start` is an x near the solution. None: the nominal geometry, and outliers are likely.
+    """
+    x, robust = (bundle.start(), True) if start is None else (start, False)
     for _ in range(_ROUNDS):
         x, used = bundle.solve(x, robust), bundle.used
         deviations = used * bundle.spot_deviations(x)

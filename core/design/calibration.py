@@ -34,6 +34,7 @@ _DISC_MISFIT = 5.0  # standard deviations by which an image may differ from a di
 _OUTLIER = 6.0  # standard deviations of an outlier from its fitted position
 _MAX_PRIOR = 5.0  # prior standard deviations by which a module's parameters may differ from the nominal ones
 _ROUNDS = 20
+_MODULES_OF_CHECK = 20  # of the fit that checks known places and distances, at least
 _MAX_SCALE = 0.02  # by which known lengths may differ from those that nominal modules see
 _FAR = 5.0  # typical deviations by which a known place, length or scale may differ from what images tell
 _SAME_MAGNIFICATION = 0.01
@@ -240,11 +241,12 @@ def calibrate(
     whitening = np.linalg.inv(np.linalg.cholesky(covariance))
     length_sd = positive(distance_sd, "calibrate: distance_sd", "mm")
     measured = positions, whitening, spots.seen, pairs[:0], lengths[:0], length_sd
-    bundle, x = BundleAdjustment(system, start, True, further, prior_sd, *measured), None
+    bundle = BundleAdjustment(system, start, True, further, prior_sd, *measured)
     if points is not None or len(pairs):
-        bundle, x = _with_known_sources(bundle, points is not None, pairs, lengths)
-    spots = replace(spots, seen=spots.seen & bundle.used.any(axis=1, keepdims=True))
-    return _make_result(views, *_fit_without_outliers(bundle, x), spots)
+        bundle = _with_known_sources(bundle, points is not None, pairs, lengths)
+    spots = replace(spots, seen=bundle.used)
+    bundle, x = _fit_without_outliers(bundle)
+    return _make_result(views, bundle, x, spots)
 
 
 def _find_spots(
@@ -327,13 +329,11 @@ def _triangulate_points(system: PinholeSystem, positions: Floats, seen: Bools) -
     return points
 
 
-def _with_known_sources(
-    free: BundleAdjustment, are_points: bool, pairs: Indexes, lengths: Floats
-) -> tuple[BundleAdjustment, Floats | None]:
-    """Return the adjustment with known `lengths` (D,), mm, of `pairs` (D, 2), or with known points, and a start of its x.
+def _with_known_sources(free: BundleAdjustment, are_points: bool, pairs: Indexes, lengths: Floats) -> BundleAdjustment:
+    """Return the adjustment with the known `lengths` (D,), mm, of `pairs` (D, 2), or with its points as the known ones.
 
-    Where two modules or more see each point, the fit without these, `free`, tells whether they are of another scale, and are
-    then not used, and which of four points or three lengths are wrong. These are left out. All of it is warned of.
+    Where two modules or more see each point, a fit of some modules without these tells whether they are of another scale,
+    and are then not used, and which of four points or three lengths are wrong. These are left out. All of it is warned of.
     """
     bundle, points, n_k = replace(free, pairs=pairs, distances=lengths), free.points, len(free.points)
     groups, labels, name = (
@@ -346,19 +346,19 @@ def _with_known_sources(
         lengths = np.linalg.norm(np.diff(points[pairs], axis=1)[:, 0], axis=1)
         groups, name = (pairs == np.arange(n_k)[:, None, None]).any(axis=2), "points"
         labels = [str(k + 1) for k in range(n_k)]
-    if free.used.sum(axis=1).min() < 2:
-        return bundle, None
-    x = free.start()
-    if are_points:  # near where the free fit ends, and found in no time
-        x[: bundle.start().size] = bundle.solve(bundle.start(), robust=True)
-    trial, x = _fit_without_outliers(free, x)
+    some = slice(None, None, max(1, len(free.system) // _MODULES_OF_CHECK))
+    trial = replace(free, system=free.system[some], positions=free.positions[:, some], whitening=free.whitening[:, some],
+                    used=free.used[:, some])  # fmt: skip
+    if trial.used.sum(axis=1).min() < 2:
+        return bundle
+    trial, x = _fit_without_outliers(trial)
     fitted = np.linalg.norm(np.diff(trial.geometry(x).points[pairs], axis=1)[:, 0], axis=1)
     scale, modules = float(np.median(lengths / np.maximum(fitted, 1e-9))), trial.used.any(axis=0)
-    scale_sd = free.sd[0] / (free.system.pinhole_distance[modules].mean() * math.sqrt(modules.sum()))
+    scale_sd = free.sd[0] / (trial.system.pinhole_distance[modules].mean() * math.sqrt(modules.sum()))
     if abs(scale - 1) > max(_MAX_SCALE, _FAR * scale_sd):
         fault = f"{scale:.3g} times as far apart as the nominal modules see them"
         warn(f"calibrate: {name}: they are {fault}, a scale; not used, the scale stays nominal")
-        return trial, x
+        return free
     errors = np.abs(lengths - scale * fitted)
     typical = np.array([np.median(errors[group]) for group in groups])
     is_wrong = typical > _FAR * max(free.distance_sd, 2 * float(np.median(typical)))
@@ -367,16 +367,13 @@ def _with_known_sources(
         texts = (f"{labels[i]}, {errors[groups[i]].max():.2f} mm off" for i in np.flatnonzero(is_wrong))
         warn(f"calibrate: {name}: {several(texts, 12)}, as the others and the images tell; left out")
     if are_points:
-        return replace(bundle, used=trial.used & ~is_wrong[:, None]), x[: bundle.start().size]
-    return replace(bundle, pairs=pairs[~is_wrong], distances=lengths[~is_wrong], used=trial.used), x
+        return replace(bundle, used=free.used & ~is_wrong[:, None])
+    return replace(bundle, pairs=pairs[~is_wrong], distances=lengths[~is_wrong])
 
 
-def _fit_without_outliers(bundle: BundleAdjustment, start: Floats | None = None) -> tuple[BundleAdjustment, Floats]:
-    """Solve the adjustment repeatedly, each time without further outliers; return it without them, and its solution x.
-
-    `start` is an x near the solution. None: the nominal geometry, and outliers are likely.
-    """
-    x, robust = (bundle.start(), True) if start is None else (start, False)
+def _fit_without_outliers(bundle: BundleAdjustment) -> tuple[BundleAdjustment, Floats]:
+    """Solve the adjustment repeatedly, each time without further outliers; return it without them, and its solution x."""
+    x, robust = bundle.start(), True
     for _ in range(_ROUNDS):
         x, used = bundle.solve(x, robust), bundle.used
         deviations = used * bundle.spot_deviations(x)

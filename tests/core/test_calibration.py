@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -13,6 +14,7 @@ from mphdrr.core.cli import main
 
 pytest.importorskip("scipy", reason="no scipy")
 
+from mphdrr.core.design import calibration_recipe
 from mphdrr.core.design.bundle import BundleAdjustment
 from mphdrr.core.geometry.frames import affine_matrix
 
@@ -279,6 +281,24 @@ def test_the_command_writes_workbook_numbers_and_picture(recipe, tmp_path, capsy
     assert main(["geometry", "calibrate", str(path), "-o", str(tmp_path / "found.xlsx")]) == 0
     text = capsys.readouterr().out
     assert "10 modules by 5 points, 50 of 50 images" in text and "all modules fit" in text
+    assert re.search(
+        r"crystals' blur: FWHM 2\.0\d\d mm, known to 0\.00\d mm|FWHM 1\.9\d\d mm, known to 0\.00\d mm", text
+    )
+    assert np.allclose(said["blur"], 2, atol=0.05) and len(said["blur_sd"]) == 10
+
+
+def test_a_recipe_says_the_source_and_the_physics(recipe, monkeypatch):
+    path, _ = recipe
+    calls = []
+    monkeypatch.setattr(calibration_recipe, "calibrate", lambda *images, **options: calls.append(options))
+    path.write_text(
+        path.read_text().replace("[sources]", "[model]\ncrystal_mu = 0.4\ndepth_layers = 5\n[sources]\ndiameter = 2")
+    )
+    calibration_recipe.run_calibration(path)
+    (options,) = calls
+    model = options["model"]
+    assert options["source_diameter"] == 2 and model.depth_layers == 5 and np.allclose(model.crystal_mu, 0.4)
+    assert model.intrinsic_fwhm == 2 and model.system.detector_thickness[0] == 10
 
 
 @pytest.mark.parametrize(
@@ -289,7 +309,9 @@ def test_the_command_writes_workbook_numbers_and_picture(recipe, tmp_path, capsy
         ("[runs]\nfiles = []", "runs.files: expected 1 or more values"),
         ("[runs]\nfiles = ['point0.h5', 'point1.h5']", "expected 3 acquisitions or more"),
         ("[priors]\nposition = 3", "priors.position: no such setting"),
-        ("[sources]\nplaces = 3", "sources.places: no such setting; expected points, distances"),
+        ("[sources]\nplaces = 3", "sources.places: no such setting; expected points, distances, diameter"),
+        ("[runs]\nfiles = ['point0.h5']\n[sources]\ndiameter = -1", "sources.diameter: expected 0 or more mm, got -1"),
+        ("[runs]\nfiles = ['point0.h5']\n[model]\ndepths = 3", "model.depths: no such setting"),
         ("[runs]\nfiles = ['point0.h5']\n[sources]\ndistances = [[1, 7, 3.0]]", "sources from 1 to 1"),
         ("[fit]\ncollimator_length = 3", "fit.collimator_length: expected true or false"),
     ],

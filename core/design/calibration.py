@@ -137,8 +137,8 @@ class Calibration:
         return [
             f"{n_moved} of {len(shifts)} modules moved, RMS {mm:.2f} mm and {degrees:.2f} degrees",
             f"farthest: module {self.system.numbers[far]}, {shifts[far]:.2f} mm and {tilts[far]:.2f} degrees",
-            f"crystals' blur: FWHM {self.blur.mean():.3f} mm, known to {self.blur_sd.mean():.3f} mm",
             f"modules that do not fit: {misfitting}" if misfitting else "all modules fit",
+            f"crystals' blur: FWHM {self.blur.mean():.3f} mm, known to {self.blur_sd.mean():.3f} mm",
             *([f"{gauge} of the scanner as a whole: nominal, these images do not determine them"] if gauge else []),
             *(f"not determined: {line}" for line in self.untold()),
         ]

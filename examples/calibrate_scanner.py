@@ -22,6 +22,7 @@ from mphdrr.core.runs.display import Display
 
 WORKBOOK = Path(__file__).with_name("dc-spect-80.xlsx")
 PHYSICS = {"isotope": "Tc-99m", "aperture_mu": "tungsten", "crystal_mu": "NaI", "intrinsic_fwhm": 1.0}
+DEPTH = {"depth_layers": 5}  # the points' photons stop in the depth of the crystal
 
 
 def main() -> None:
@@ -47,10 +48,10 @@ def main() -> None:
     # Eight acquisitions of a point source each, and the calibration by them.
     corners = np.array([[x, y, z] for x in (-40.0, 40.0) for y in (-40.0, 40.0) for z in (-40.0, 40.0)])
     points = corners + rng.normal(0, 3.0, corners.shape)
-    model = mph.Emission(true, **PHYSICS)
+    model = mph.Emission(true, **PHYSICS, **DEPTH)
     expected = mph.point_images(model, true.views(shape), points)
     images = rng.poisson(expected * 20_000 / expected.sum((2, 3)).mean())
-    found = mph.calibrate(nominal, images, nominal.views(shape), model=mph.Emission(nominal, **PHYSICS))
+    found = mph.calibrate(nominal, images, nominal.views(shape), model=mph.Emission(nominal, **PHYSICS, **DEPTH))
     print(f"calibrated in {time.perf_counter() - began:.1f} s: chi-square {np.nanmean(found.chi_square):.3f}")
     for name, sd in zip(found.names, np.sqrt((found.spread**2).mean(axis=0)), strict=True):
         print(

@@ -7,17 +7,19 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..arrays import ArrayLike, Bools, Floats, Indexes
-from ..errors import InputError, several
+from ..errors import InputError, several, warn
 from ..geometry.system import PinholeSystem
 from ..geometry.views import Views
 from ..models.emission import Emission
 from ..models.model import with_image_axes
-from ..progress import Progress, stages_of
+from ..physics.energy_window import FWHM_PER_SIGMA
+from ..progress import Progress, Stages, stages_of
 from ..runs.display import DIVERGING, Display
 from ..runs.mosaic import MosaicSheet, draw_sheet
 from ..validation import instance, one_of, positive, real_array, shape_text
 from .bundle import LENGTH, OFFSET, BundleAdjustment, FittedGeometry
-from .point_images import PixelLattice
+from .calibration_checks import warn_of_fit, warn_of_inputs
+from .point_images import SpotModel
 from .solvers import scipy_module
 from .spots import Spots, find_spots
 
@@ -32,6 +34,11 @@ _DISC_MISFIT = 5.0  # standard deviations by which an image may differ from a di
 _OUTLIER = 6.0  # standard deviations of an outlier from its fitted position
 _MAX_PRIOR = 5.0  # prior standard deviations by which a module's parameters may differ from the nominal ones
 _ROUNDS = 20
+_MODULES_OF_CHECK = 20  # of the fit that checks known places and distances, at least
+_MAX_SCALE = 0.02  # by which known lengths may differ from those that nominal modules see
+_FAR = 5.0  # typical deviations by which a known place, length or scale may differ from what images tell
+_SAME_MAGNIFICATION = 0.01
+_SPOT_ROUNDS = 6  # searches for spots, each with better known blur and magnifications
 _FALSE_ALARM = 1e-3  # probability that any module of a correct model is reported as misfitting
 _UNMOVED = 1e-6  # mm and degrees; smaller changes are rounding
 _DETERMINED = 0.75  # share of a parameter's prior variance that images must remove to determine it
@@ -80,6 +87,10 @@ class Calibration:
         Shift of the pixels on the crystal from those of the nominal views, mm along u and v.
     residuals : array (M, n_v, n_u)
         Counts around each module's spots, summed over its spots, minus expected counts, in standard deviations.
+    blur : array (M,)
+        FWHM of the crystals' blur, mm, fitted with one factor for all modules.
+    blur_sd : array (M,)
+        Standard deviations of `blur`, mm.
     """
 
     system: PinholeSystem
@@ -97,6 +108,8 @@ class Calibration:
     gauge: tuple[str, ...]
     detector_offset: Floats
     residuals: Floats
+    blur: Floats
+    blur_sd: Floats
 
     def untold(self) -> list[str]:
         """Return lines with the parameters that the images hardly determine, such as "modules 3, 17: length"."""
@@ -125,6 +138,7 @@ class Calibration:
             f"{n_moved} of {len(shifts)} modules moved, RMS {mm:.2f} mm and {degrees:.2f} degrees",
             f"farthest: module {self.system.numbers[far]}, {shifts[far]:.2f} mm and {tilts[far]:.2f} degrees",
             f"modules that do not fit: {misfitting}" if misfitting else "all modules fit",
+            f"crystals' blur: FWHM {self.blur.mean():.3f} mm, known to {self.blur_sd.mean():.3f} mm",
             *([f"{gauge} of the scanner as a whole: nominal, these images do not determine them"] if gauge else []),
             *(f"not determined: {line}" for line in self.untold()),
         ]
@@ -144,14 +158,15 @@ def calibrate(
     collimator_length_sd: float = 1.0,
     detector_offset_sd: float = 0.5,
     distance_sd: float = 0.02,
+    source_diameter: float = 0.0,
     progress: Progress | None = None,
 ) -> Calibration:
     """Determine the positions and tilts of a scanner's modules from images of point sources, one source per acquisition.
 
     In each of K acquisitions, the centre of each module's spot is found by maximum likelihood (Poisson), with the shadow of
-    the hole in closed form. The spot's counts and radius and a uniform background are free, so that neither activities nor
-    hole diameters need be known. Modules and points are the least-squares solution for all centres (SciPy). Images that do
-    not fit are not used, and their modules are reported.
+    the hole in closed form. The spot's counts and radius and a uniform background are free, and so is a factor of all
+    crystals' blur: neither activities nor hole diameters nor the blur need be known. Modules and points are the
+    least-squares solution for all centres (SciPy). Images that do not fit are not used, and their modules are reported.
 
     Parameters
     ----------
@@ -167,8 +182,9 @@ def calibrate(
         Known distances (K, K) between sources, mm, NaN for unknown ones; they determine the scale. None: the scale stays
         nominal.
     model
-        Emission model with the holes, the crystal's blur and the background. None: a crystal without blur, whose sharp
-        shadows make the covariances too small for a crystal with blur.
+        Emission model with the holes and their edge, the crystals with their depth of interaction (`depth_layers`), and the
+        background. The fit of the blur starts from `intrinsic_fwhm`, of which modules keep their ratios, or from a pixel's
+        width. None: ``Emission(system)``.
     fit
         Parameters that are fitted besides positions and tilts, of "collimator_length" and "detector_offset".
     position_sd, tilt_sd_degrees, collimator_length_sd, detector_offset_sd
@@ -176,14 +192,22 @@ def calibrate(
         weak compared with images; a parameter that no image determines stays nominal.
     distance_sd
         Standard deviation of the known distances, mm.
+    source_diameter
+        Diameter of the sources, balls, mm; 1.29 times the side of cubes. 0: points.
     progress
-        Called with (done, total) acquisitions.
+        Called with (done, total) steps of each search for spots.
 
     Raises
     ------
     InputError
         There are too few points, an acquisition shows none, images and views are not of the system, most modules are farther
         from the nominal geometry than allowed, or SciPy is missing.
+
+    Warns
+    -----
+    InputWarning
+        Known places or distances are of another scale, or some are wrong (these are not used); images are no counts; spots
+        are wider than holes and sources let expect; a crystal of more than 2 mm has no depth of interaction.
     """
     instance(system, PinholeSystem, "calibrate: system")
     instance(views, Views, "calibrate: views")
@@ -201,43 +225,66 @@ def calibrate(
     further = tuple(name for name in FITTED if name in fit)
     sd = [position_sd] * 3 + [math.radians(tilt_sd_degrees)] * 3 + [x for name in further for x in further_sd[name]]
     prior_sd = np.array([positive(x, "calibrate: standard deviations") for x in sd])
+    warn_of_inputs(model, images)
     pairs, lengths = _known_distances(distances, n_k)
     if points is not None and len(pairs):
         raise InputError("calibrate: give points or distances, not both")
-    lattice = PixelLattice.from_views(model, views)
-    radii = model.effective_diameter / 2 * (1 + system.collimator_length / system.pinhole_distance)
-    stages = stages_of(progress)
-    spots = find_spots(images, with_image_axes(model.background), lattice, radii, stages("finding spots"))
+    known, stages = None if points is None else real_array(points, "calibrate: points", (n_k, 3)), stages_of(progress)
+    spots, start = _find_spots(images, model, SpotModel.from_model(model, views, source_diameter), known, stages)
     stages("finding modules")
-    _require_spots(spots.seen, 2 if points is None else 1)
-    positions = lattice.first + lattice.step * spots.pixels
-    covariance = spots.covariance * lattice.step[:, :, None] * lattice.step[:, None, :]
-    pearson, freedom = spots.pearson(lattice)
+    covariance, positions = spots.covariance[..., :2, :2].copy(), spots.centers.copy()
+    pearson, freedom = spots.pearson()
     # The centre of a spot that is not like a disc is less certain.
     ratio, limit = pearson / np.maximum(freedom, 1), 1 + _DISC_MISFIT * np.sqrt(2 / np.maximum(freedom, 1))
     covariance *= np.where(ratio > limit, ratio, 1.0)[..., None, None]
     covariance[~spots.seen], positions[~spots.seen] = np.eye(2), 0.0
     whitening = np.linalg.inv(np.linalg.cholesky(covariance))
-    start = _triangulate_points(system, positions, spots.seen) if points is None else points
-    start = real_array(start, "calibrate: points", (n_k, 3))
-    measured = positions, whitening, spots.seen, pairs, lengths, positive(distance_sd, "calibrate: distance_sd", "mm")
-    bundle, x = _fit_without_outliers(BundleAdjustment(system, start, points is None, further, prior_sd, *measured))
-    return _make_result(views, bundle, x, spots, lattice)
+    length_sd = positive(distance_sd, "calibrate: distance_sd", "mm")
+    measured = positions, whitening, spots.seen, pairs[:0], lengths[:0], length_sd
+    bundle = BundleAdjustment(system, start, True, further, prior_sd, *measured)
+    if points is not None or len(pairs):
+        bundle = _with_known_sources(bundle, points is not None, pairs, lengths)
+    spots = replace(spots, seen=bundle.used)
+    bundle, x = _fit_without_outliers(bundle)
+    return _make_result(views, bundle, x, spots)
+
+
+def _find_spots(
+    images: Floats, model: Emission, spot_model: SpotModel, points: Floats | None, stages: Stages
+) -> tuple[Spots, Floats]:
+    """Return the spots in `images` (K, M, n_v, n_u), and the points (K, 3), mm: known ones, or a start of their fit.
+
+    The spots' widths depend on the blur and on the points' distances, so they are searched for several times.
+    """
+    system, spots = model.system, None
+    magnification = np.tile(system.collimator_length / system.pinhole_distance, (len(images), 1))
+    sigma = np.broadcast_to(model.optics.intrinsic_fwhm, len(system)) / FWHM_PER_SIGMA
+    sigma = np.where(sigma > 0, sigma, np.abs(spot_model.lattice.step).mean())
+    for _ in range(_SPOT_ROUNDS):
+        background = with_image_axes(model.background)
+        spots = find_spots(images, background, spot_model, sigma, magnification, spots, stages("finding spots"))
+        _require_spots(spots.seen, 2 if points is None else 1)
+        start = _triangulate_points(system, spots.centers, spots.seen) if points is None else points
+        heights = np.einsum("mj,kmj->km", system.frames()[:, 2], start[:, None] - system.centers)
+        fits_window, sigma = (spots.sigma < 1.2 * sigma).all(), spots.sigma
+        magnification = system.collimator_length / np.maximum(heights, system.collimator_length)
+        if fits_window and (np.abs(magnification - spots.magnification) < _SAME_MAGNIFICATION).all():
+            break
+    return spots, start  # type: ignore[return-value]  # after one round at least
 
 
 def _check_model(model: Emission, system: PinholeSystem, views: Views) -> None:
-    """Raise `InputError` unless the model is that of the system and of a hole's shadow on the crystal's front."""
+    """Raise `InputError` unless the model is that of the system and of a hole's shadow."""
     instance(model, Emission, "calibrate: model")
     if len(model.system) != len(system) or not np.allclose(model.system.poses(), system.poses()):
         raise InputError("calibrate: model: expected that of the system, Emission(system, ...)")
     model.check(views)
     is_uneven = np.ndim(model.efficiency) == 3 or not np.all(model.efficiency)
-    refused = {"edge 'path'": model.edge == "path", "depth_layers": model.depth_layers > 1}
-    refused |= {"wall_thickness": model.wall_thickness is not None}
-    refused |= {"lines apart": model.is_apart, "efficiency of single pixels, or of 0": is_uneven}
+    refused = {"wall_thickness": model.wall_thickness is not None, "lines apart": model.is_apart}
+    refused["efficiency of single pixels, or of 0"] = is_uneven
     for name, is_refused in refused.items():
         if is_refused:
-            raise InputError(f"calibrate: model: takes no {name}: a spot is a hole's shadow on the crystal's front")
+            raise InputError(f"calibrate: model: takes no {name}: a spot is a hole's shadow")
 
 
 def _known_distances(distances: ArrayLike | None, n_k: int) -> tuple[Indexes, Floats]:
@@ -282,6 +329,48 @@ def _triangulate_points(system: PinholeSystem, positions: Floats, seen: Bools) -
     return points
 
 
+def _with_known_sources(free: BundleAdjustment, are_points: bool, pairs: Indexes, lengths: Floats) -> BundleAdjustment:
+    """Return the adjustment with the known `lengths` (D,), mm, of `pairs` (D, 2), or with its points as the known ones.
+
+    Where two modules or more see each point, a fit of some modules without these tells whether they are of another scale,
+    and are then not used, and which of four points or three lengths are wrong. These are left out. All of it is warned of.
+    """
+    bundle, points, n_k = replace(free, pairs=pairs, distances=lengths), free.points, len(free.points)
+    groups, labels, name = (
+        np.eye(len(pairs)) > 0,
+        [f"{i} to {j}" for i, j in pairs + 1],
+        "distances",
+    )  # that are right or wrong
+    if are_points:
+        bundle, pairs = replace(free, fits_points=False), np.argwhere(np.triu(np.ones((n_k, n_k)), 1))
+        lengths = np.linalg.norm(np.diff(points[pairs], axis=1)[:, 0], axis=1)
+        groups, name = (pairs == np.arange(n_k)[:, None, None]).any(axis=2), "points"
+        labels = [str(k + 1) for k in range(n_k)]
+    some = slice(None, None, max(1, len(free.system) // _MODULES_OF_CHECK))
+    trial = replace(free, system=free.system[some], positions=free.positions[:, some], whitening=free.whitening[:, some],
+                    used=free.used[:, some])  # fmt: skip
+    if trial.used.sum(axis=1).min() < 2:
+        return bundle
+    trial, x = _fit_without_outliers(trial)
+    fitted = np.linalg.norm(np.diff(trial.geometry(x).points[pairs], axis=1)[:, 0], axis=1)
+    scale, modules = float(np.median(lengths / np.maximum(fitted, 1e-9))), trial.used.any(axis=0)
+    scale_sd = free.sd[0] / (trial.system.pinhole_distance[modules].mean() * math.sqrt(modules.sum()))
+    if abs(scale - 1) > max(_MAX_SCALE, _FAR * scale_sd):
+        fault = f"{scale:.3g} times as far apart as the nominal modules see them"
+        warn(f"calibrate: {name}: they are {fault}, a scale; not used, the scale stays nominal")
+        return free
+    errors = np.abs(lengths - scale * fitted)
+    typical = np.array([np.median(errors[group]) for group in groups])
+    is_wrong = typical > _FAR * max(free.distance_sd, 2 * float(np.median(typical)))
+    is_wrong &= len(groups) > (3 if are_points else 2)
+    if is_wrong.any():
+        texts = (f"{labels[i]}, {errors[groups[i]].max():.2f} mm off" for i in np.flatnonzero(is_wrong))
+        warn(f"calibrate: {name}: {several(texts, 12)}, as the others and the images tell; left out")
+    if are_points:
+        return replace(bundle, used=free.used & ~is_wrong[:, None])
+    return replace(bundle, pairs=pairs[~is_wrong], distances=lengths[~is_wrong])
+
+
 def _fit_without_outliers(bundle: BundleAdjustment) -> tuple[BundleAdjustment, Floats]:
     """Solve the adjustment repeatedly, each time without further outliers; return it without them, and its solution x."""
     x, robust = bundle.start(), True
@@ -309,7 +398,7 @@ def _fit_without_outliers(bundle: BundleAdjustment) -> tuple[BundleAdjustment, F
     return bundle, x
 
 
-def _make_result(views: Views, bundle: BundleAdjustment, x: Floats, spots: Spots, lattice: PixelLattice) -> Calibration:
+def _make_result(views: Views, bundle: BundleAdjustment, x: Floats, spots: Spots) -> Calibration:
     """Return the result of an adjustment with the solution x: geometry, uncertainties and tests of the fit."""
     nominal, fitted, seen, used = bundle.system, bundle.geometry(x), spots.seen, bundle.used
     covariance, leverages = bundle.covariance(x)
@@ -318,13 +407,14 @@ def _make_result(views: Views, bundle: BundleAdjustment, x: Floats, spots: Spots
     # Shifts along the axes of the fitted module instead of the nominal one.
     units[:, :3, :3] = fitted.frames @ nominal.frames().swapaxes(1, 2) * bundle.sd[:3]
     covariance = units @ covariance @ units.swapaxes(1, 2)
-    squared, (pearson, freedom) = bundle.spot_deviations(x) ** 2, spots.pearson(lattice)
+    squared, (pearson, freedom) = bundle.spot_deviations(x) ** 2, spots.pearson()
     spot_freedom, pixel_freedom = (2 * used - leverages).sum(axis=0), (seen * (freedom + 2) - leverages).sum(axis=0)
     sums = ((used * squared).sum(axis=0), spot_freedom), ((seen * (pearson + squared)).sum(axis=0), pixel_freedom)
     misfit, chi_square = (np.where(n > 0.5, total / np.maximum(n, 0.5), np.nan) for total, n in sums)
     misfits = (seen & ~used).any(axis=0) | _is_improbable(misfit, spot_freedom)
     misfits |= _is_improbable(chi_square, pixel_freedom)
-    expected = spots.expected(lattice, (fitted.project_points() - lattice.first) / lattice.step)
+    warn_of_fit(spots, used, fitted, chi_square)
+    expected = spots.expected(fitted.project_points())
     excess, total = ((seen[..., None, None] * w).sum(axis=0) for w in (spots.windows - expected, expected))
     further_names = {LENGTH: ("length",), OFFSET: ("offset u", "offset v")}
     names = (*_PARAMETERS, *(name for kind in bundle.fit for name in further_names[kind]))
@@ -333,7 +423,8 @@ def _make_result(views: Views, bundle: BundleAdjustment, x: Floats, spots: Spots
     return Calibration(system, nominal, _move_views(views, nominal, fitted), fitted.points, covariance[:, :6, :6],
                        chi_square, misfit, tuple(nominal.numbers[misfits].tolist()), used, names,
                        np.sqrt(np.diagonal(covariance, axis1=1, axis2=2)), told, gauge, fitted.offset,
-                       excess / np.sqrt(np.maximum(total, 1)))  # fmt: skip
+                       excess / np.sqrt(np.maximum(total, 1)), FWHM_PER_SIGMA * spots.sigma,
+                       FWHM_PER_SIGMA * spots.sigma_sd)  # fmt: skip
 
 
 def _is_improbable(per_freedom: Floats, freedom: Floats) -> Bools:

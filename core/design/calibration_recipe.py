@@ -1,4 +1,4 @@
-"""Recipes of calibrations, in TOML: the runs, known sources, fitted parameters and prior standard deviations."""
+"""Recipes of calibrations, in TOML: the runs and their physics, sources, fitted parameters and prior standard deviations."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -17,7 +17,8 @@ from ..recipes.toml import read_toml
 from ..recipes.values import Values
 from ..runs.files import read_run
 from ..runs.run_recipe import recipe_model
-from ..validation import real_array
+from ..runs.settings import SETTINGS
+from ..validation import at_least_0, real_array
 from ..workbook import read_system
 from .bundle import LENGTH, OFFSET
 from .calibration import Calibration, calibrate
@@ -35,7 +36,7 @@ _ROWS = settings_by_key((
     Setting(f"priors.{OFFSET}_sd", float, 0.5, _SD + "the pixels from their nominal positions", unit="mm", above=0),
     Setting("priors.distance_sd", float, 0.02, _SD + "known distances between sources", unit="mm", above=0),
 ))  # fmt: skip
-_SOURCES = ("points", "distances")
+_SOURCES = ("points", "distances", "diameter")
 
 
 class _CalibrationSettings(Values):
@@ -55,6 +56,8 @@ def run_calibration(path: AnyPath, progress: Progress | None = None) -> Calibrat
         for name in sources.keys() - set(_SOURCES):
             raise InputError(f"sources.{name}: no such setting; expected {', '.join(_SOURCES)}")
         tables.pop("sources", None)
+        changes = flat_entries({"model": read_table(tables, "model")}, SETTINGS, "model")
+        tables.pop("model", None)
         recipe = _CalibrationSettings(
             flat_entries(tables, _ROWS, *(name for name in tables if isinstance(tables[name], dict)))
         )
@@ -62,17 +65,19 @@ def run_calibration(path: AnyPath, progress: Progress | None = None) -> Calibrat
         runs = [read_run(folder / name) for name in files]
         workbook = recipe["system.file"]
         system = runs[0].system if workbook is None else read_system(folder / workbook)
-        model = recipe_model(runs[0].recipe, system, run=runs[0])
+        model = recipe_model(runs[0].recipe.updated(changes), system, run=runs[0])
         if not isinstance(system, PinholeSystem) or not isinstance(model, Emission):
             raise InputError("runs.files: expected runs of counts of pinholes")
         for name, run in zip(files, runs, strict=True):
             if run.projections.shape != runs[0].projections.shape or not _have_same_poses(run.system, system):
                 raise InputError(f"runs.files: {name}: expected the modules of {workbook or files[0]}")
+        diameter = at_least_0(sources.get("diameter", 0.0), "sources.diameter", "mm")
         priors = {key.partition(".")[2]: recipe[key] for key in _ROWS if key.startswith("priors.")}
         return calibrate(
             system, np.stack([run.projections for run in runs]), runs[0].views, sources.get("points"),
             _distance_table(sources.get("distances"), len(runs)), model=replace(model, background=runs[0].background),
-            fit=[name for name in (LENGTH, OFFSET) if recipe[f"fit.{name}"]], **priors, progress=progress,
+            fit=[name for name in (LENGTH, OFFSET) if recipe[f"fit.{name}"]], **priors, source_diameter=diameter,
+            progress=progress,
         )  # fmt: skip
 
 

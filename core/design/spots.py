@@ -1,63 +1,86 @@
 """Spots of point sources in the modules' images: their centres, the centres' covariances, and tests of their shape.
 
-If the radius of the hole's shadow, its counts and a uniform background are free in each image, the image depends on the
-geometry only through the shadow's centre. The centres and their covariances are therefore all that a calibration needs;
-activity, hole diameter and the crystal's efficiency have no influence on a module's position.
+If the radius of the hole's shadow, its counts and a uniform background are free in each image, and the crystal's blur in
+all images together, an image depends on the geometry only through the shadow's centre. The centres and their covariances
+are therefore all that a calibration needs; activity, hole diameter, blur and the crystal's efficiency have no influence on
+a module's position.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
 from ..arrays import Array, Bools, Floats
 from ..progress import Progress, tell
-from .point_images import PixelLattice, disc_fractions
+from .point_images import SpotModel
 from .solvers import scipy_module
 
 _MARGIN = 3  # pixels around the expected shadow
 _MIN_COUNTS, _SIGNIFICANCE = 20, 6.0  # of a spot; standard deviations of its counts above the background
-_STEPS, _CONVERGED = 25, 0.01  # largest number of Fisher's scoring steps; size of the last one in standard deviations
+_STEPS, _CONVERGED = 40, 0.01  # largest number of Fisher's scoring steps; size of the last one in standard deviations
+_FIRST_STEPS = 4  # with the told radii: with a blur far from the right one, too, their best values would be far off
 # Smallest background of a pixel, as a fraction of the counts of a pixel in the shadow: stray counts are always possible.
 _MIN_BACKGROUND = 1e-5
+_RADII = 0.5, 2.0  # limits of a shadow's radius, by that of the hole
+_MIN_BLUR = 0.03  # pixels; a smaller blur changes no image
+_MAX_CHI_SQUARE = 2.0  # of the spots that the blur is fitted to, by that of half of the spots
 
 
 @dataclass(frozen=True)
 class Spots:
     """Spots of K acquisitions in M modules, found by `find_spots`."""
 
+    model: SpotModel
+    """Pixels, hole, crystal and source."""
+    magnification: Floats
+    """Magnifications (K, M)."""
+    sigma: Floats
+    """Standard deviations (M,) of the crystals' blur, mm."""
     seen: Bools
     """Mask (K, M) of the modules with a whole spot."""
-    pixels: Floats
-    """Centres (K, M, 2), column and row."""
+    values: Floats
+    """Centre along u and v, mm on the crystal's front, radius of the shadow, mm, counts, and uniform background, counts per
+    pixel, of the spots, (K, M, 5)."""
     covariance: Floats
-    """Covariance of the centres (K, M, 2, 2), px^2."""
-    radii: Floats
-    """Radii of the shadows (K, M), mm."""
-    counts: Floats
-    """Expected counts of the spots (K, M), without background."""
-    uniform: Floats
-    """Uniform background (K, M), counts per pixel, besides the known one."""
+    """Covariance of the centres and the radius (K, M, 3, 3), mm^2."""
     first: Array
     """Column and row (K, M, 2) of the first pixels of windows around the spots."""
     windows: Floats
     """Counts in the windows (K, M, n_v, n_u)."""
     background: Floats
     """Known background in the windows (K, M, n_v, n_u), counts."""
+    score: Floats
+    """Derivatives (K, M) of the likelihood's logarithm by the square of the largest `sigma`, 1/mm^2."""
+    gain: Floats
+    """Information (K, M) of each spot on this square, 1/mm^4."""
 
-    def expected(self, lattice: PixelLattice, pixels: Floats) -> Floats:
-        """Return the expected counts in the windows (K, M, n_v, n_u) for centres at columns and rows `pixels` (K, M, 2)."""
-        n_v, n_u = self.windows.shape[2:]
-        pitch, blurs = np.abs(lattice.step), lattice.blurs((n_v, n_u))
-        discs = zip(pixels - self.first, self.radii, strict=True)
-        fractions = [disc_fractions(centers, radii, pitch, (n_v, n_u), blurs)[0] for centers, radii in discs]
-        return self.counts[..., None, None] * fractions + self.uniform[..., None, None] + self.background
+    @property
+    def sigma_sd(self) -> Floats:
+        """Standard deviations (M,) of `sigma`, mm."""
+        square_sd = max(float(self.gain[self.seen].sum()), 1e-30) ** -0.5
+        widest = float(self.sigma.max())
+        return self.sigma / widest * min(square_sd / (2 * widest), square_sd**0.5)
 
-    def pearson(self, lattice: PixelLattice) -> tuple[Floats, Floats]:
+    @property
+    def centers(self) -> Floats:
+        """Centres (K, M, 2), mm on the crystal's front."""
+        return self.values[..., :2]
+
+    def expected(self, centers: Floats) -> Floats:
+        """Return the expected counts in the windows (K, M, n_v, n_u) for spots at `centers` (K, M, 2), mm."""
+        spots = zip(centers, self.values[..., 2], self.magnification, self.first, strict=True)
+        shape = self.windows.shape[2], self.windows.shape[3]
+        fractions = [self.model.fractions(x, r, self.sigma, m, shape, first)[0] for x, r, m, first in spots]
+        counts, uniform = (self.values[..., i, None, None] for i in (3, 4))
+        return counts * fractions + uniform + self.background
+
+    def pearson(self) -> tuple[Floats, Floats]:
         """Return Pearson's chi-square (K, M) of the windows, and its degrees of freedom (K, M).
 
         Pixels with less than one expected count are combined into a single one.
         """
-        expected = self.expected(lattice, self.pixels)
+        expected = self.expected(self.centers)
         bright = expected >= 1
         bright_sum = (bright * (self.windows - expected) ** 2 / np.maximum(expected, 1)).sum((2, 3))
         dim_counts, dim_expected = ((~bright * counts).sum((2, 3)) for counts in (self.windows, expected))
@@ -68,13 +91,14 @@ class Spots:
 
 
 def find_spots(
-    images: Floats, background: Floats, lattice: PixelLattice, radii: Floats, progress: Progress | None = None
-) -> Spots:
-    """Find the spots in images (K, M, n_v, n_u) of one point source per acquisition.
+    images: Floats, background: Floats, model: SpotModel, sigma: Floats, magnification: Floats,
+    start: Spots | None = None, progress: Progress | None = None,
+) -> Spots:  # fmt: skip
+    """Find the spots in images (K, M, n_v, n_u) of one point source per acquisition, and the crystals' blur.
 
     Fisher's scoring, from the centroid of the brightest window, finds the maximum of the Poisson likelihood by centre,
-    radius, counts and background. For shadows with a sharp edge and few counts per pixel, the stated covariance is too
-    small.
+    radius, counts and background of each spot, and by a factor of the blur of all. For shadows with a sharp edge and few
+    counts per pixel, the stated covariance is too small.
 
     Parameters
     ----------
@@ -82,83 +106,126 @@ def find_spots(
         Measured counts.
     background
         Known background, which broadcasts to one acquisition.
-    lattice
-        Pixels of the modules.
-    radii
-        Approximate radii of the shadows (M,), mm.
+    model
+        Pixels, hole, crystal and source.
+    sigma
+        Standard deviations (M,) of the blur to start from, mm; their ratios are kept.
+    magnification
+        Magnifications (K, M).
+    start
+        Spots of another blur or magnification to start from. None: the centroids of the brightest windows.
     progress
-        Called with (done, total) acquisitions.
+        Called with (done, total) steps.
     """
-    acquisitions = []
-    for k, counts in enumerate(images):
-        acquisitions.append(_find_in_acquisition(counts, np.broadcast_to(background, counts.shape), lattice, radii))
-        tell(progress, k + 1, len(images))
-    return Spots(*(np.array(arrays) for arrays in zip(*acquisitions, strict=True)))
+    radii = model.hole_radius * (1 + magnification)
+    pitch, size = np.abs(model.lattice.step), np.array(model.lattice.shape[::-1])
+    parallax = model.thickness / 4 * np.abs(model.lattice.first).max(axis=1) / model.length
+    reach = (radii.max(axis=0) + 3 * sigma + parallax)[:, None] / pitch
+    n_u, n_v = np.minimum(2 * (np.ceil(reach.max(axis=0)).astype(int) + _MARGIN) + 1, size)
+    background = np.broadcast_to(background, images.shape)
+    cut = map(partial(_cut_windows, model, (n_v, n_u)), images, background, radii)
+    seen, values, first, windows, known = map(np.array, zip(*cut, strict=True))
+    if start is not None:
+        values = np.where((start.seen & seen)[..., None], start.values, values)
+    nothing = np.zeros((*seen.shape, 3, 3)), first, windows, known, 0.0 * seen, 0.0 * seen
+    spots = Spots(model, magnification, sigma, seen, values, *nothing)
+    spots = _maximize_likelihood(spots, _FIRST_STEPS if start is None else 0, progress)
+    pixels = (spots.centers - model.lattice.first) / model.lattice.step
+    inside = np.minimum(pixels, size - 1 - pixels) + 0.5 >= spots.values[..., 2, None] / pitch
+    inside &= np.abs(pixels - first - [n_u // 2, n_v // 2]) < [n_u // 2, n_v // 2]
+    return replace(spots, seen=seen & inside.all(axis=2))
 
 
-def _find_in_acquisition(counts: Floats, background: Floats, lattice: PixelLattice, radii: Floats) -> tuple[Array, ...]:
-    """Return the fields of `Spots` for the images `counts` (M, n_v, n_u) of one acquisition.
+def _cut_windows(
+    model: SpotModel, shape: tuple[int, int], counts: Floats, background: Floats, radii: Floats
+) -> tuple[Bools, Floats, Array, Floats, Floats]:
+    """Return the first fields of `Spots` for the images `counts` (M, n_v, n_u) of one acquisition, in windows of `shape`.
 
-    `background` (M, n_v, n_u) are the known counts besides the spots, `radii` (M,) the approximate radii of the shadows, mm.
+    They are the mask of spots, starts of their values, first pixels, windows and their background. `background` (M, n_v,
+    n_u) are the known counts besides the spots, `radii` (M,) the approximate radii of the shadows, mm.
     """
-    pitch, size = np.abs(lattice.step), np.array(lattice.shape[::-1])
-    reach = np.ceil(((radii + 3 * lattice.sigma)[:, None] / pitch).max(axis=0)).astype(int) + _MARGIN
-    n_u, n_v = np.minimum(2 * reach + 1, size)
+    lattice, (n_v, n_u) = model.lattice, shape
     uniform = np.maximum(np.median(counts - background, axis=(1, 2)), 0)
-    width = np.ceil(1.5 * (radii[:, None] / pitch).max(axis=0)).astype(int)
+    width = np.ceil(1.5 * (radii[:, None] / np.abs(lattice.step)).max(axis=0)).astype(int)
     sums = scipy_module("ndimage").uniform_filter(counts - background, (0, width[1], width[0]), mode="constant")
     row, column = np.unravel_index(sums.reshape(len(counts), -1).argmax(axis=1), lattice.shape)
-    first = np.clip(np.stack([column, row], axis=1) - [n_u // 2, n_v // 2], 0, size - [n_u, n_v])
-    windows, background_windows = (_cut_windows(images, first, n_v, n_u) for images in (counts, background))
-    excess = windows - background_windows - uniform[:, None, None]
+    brightest, size = np.stack([column, row], axis=1), np.array(lattice.shape[::-1])
+    first = np.clip(brightest - [n_u // 2, n_v // 2], 0, size - [n_u, n_v])
+    columns, rows = first[:, 0, None, None] + np.arange(n_u), first[:, 1, None, None] + np.arange(n_v)[:, None]
+    windows, known = (x[np.arange(len(x))[:, None, None], rows, columns] for x in (counts, background))
+    excess = windows - known - uniform[:, None, None]
     totals = excess.sum((1, 2))
     seen = (totals >= _MIN_COUNTS) & (totals > _SIGNIFICANCE * np.sqrt(windows.sum((1, 2))))
-    centroids = [
-        (excess.sum(axis) * np.arange(n)).sum(1) / np.where(seen, totals, np.inf) for axis, n in ((1, n_u), (2, n_v))
-    ]
-    start = np.stack([*centroids, radii, np.maximum(totals, 1.0), uniform])
-    values, covariance = _maximize_likelihood(windows, background_windows, start, pitch, lattice.blurs((n_v, n_u)))
-    pixels = first + values[:2].T
-    inside = np.minimum(pixels, size - 1 - pixels) + 0.5 >= values[2][:, None] / pitch
-    seen &= (inside & (np.abs(pixels - first - reach) < reach)).all(axis=1)
-    return seen, pixels, covariance, *values[2:], first, windows, background_windows
+    moments = (excess.sum(axis) * np.arange(n) for axis, n in ((1, n_u), (2, n_v)))
+    centroids = np.stack([moment.sum(1) / np.where(seen, totals, np.inf) for moment in moments], axis=1)
+    centers = lattice.first + lattice.step * (first + centroids)
+    return seen, np.column_stack([centers, radii, np.maximum(totals, 1.0), uniform]), first, windows, known
 
 
-def _cut_windows(images: Floats, first: Array, n_v: int, n_u: int) -> Floats:
-    """Return the windows (M, n_v, n_u) of images, each from its own `first` (M, 2) column and row on."""
-    column, row = first[:, 0, None, None] + np.arange(n_u), first[:, 1, None, None] + np.arange(n_v)[:, None]
-    return images[np.arange(len(images))[:, None, None], row, column]
+def _maximize_likelihood(spots: Spots, n_first: int, progress: Progress | None) -> Spots:
+    """Return the spots with the values and the blur of the largest likelihood, from those that they have.
 
-
-def _maximize_likelihood(
-    windows: Floats, background: Floats, start: Floats, pitch: Floats, blurs: tuple[Floats, Floats] | None
-) -> tuple[Floats, Floats]:
-    """Return the maximum-likelihood parameters (5, S) of the spots in windows (S, n_v, n_u), and a covariance (S, 2, 2).
-
-    The parameters are column, row, radius (mm), counts and uniform background, and so are those of `start`; the covariance
-    is that of column and row. A background at its lower limit is returned as 0.
+    During `n_first` steps the radii stay. A background at its lower limit is returned as 0.
     """
-    values, (n_v, n_u) = start.copy(), windows.shape[1:]
-    per_spot = (-1, 1, 1)
-    for _ in range(_STEPS):
-        fractions, d_fractions = disc_fractions(values[:2].T, values[2], pitch, (n_v, n_u), blurs)
-        floor = _MIN_BACKGROUND * values[3] * pitch.prod(axis=1) / (np.pi * values[2] ** 2)
-        values[4] = np.maximum(values[4], floor)
-        expected = values[3].reshape(per_spot) * fractions + values[4].reshape(per_spot) + background
-        gradient = np.stack([*values[3].reshape(per_spot) * d_fractions, fractions, np.ones_like(fractions)], axis=1)
-        gradient = gradient.reshape(*gradient.shape[:2], -1)  # of the expected counts, (S, 5, pixels)
-        weighted = gradient / expected.reshape(len(gradient), 1, -1)
-        information = weighted @ gradient.swapaxes(1, 2)
-        information += 1e-9 * np.eye(5) * information.diagonal(axis1=1, axis2=2)[:, None] + 1e-30 * np.eye(5)
-        covariance = np.linalg.inv(information)
-        step = (covariance @ (weighted @ (windows - expected).reshape(len(gradient), -1, 1)))[..., 0].T
-        size = np.abs(step) / np.sqrt(covariance.diagonal(axis1=1, axis2=2).T)
-        radius_in_pixels = values[2] / pitch.T
+    values, seen, pitch = spots.values.copy(), spots.seen, np.abs(spots.model.lattice.step)
+    profile, square = spots.sigma / spots.sigma.max(), float(spots.sigma.max()) ** 2
+    limits = (_MIN_BLUR * float(pitch.min())) ** 2, 4 * square  # a wider blur needs larger windows
+    radii = spots.model.hole_radius * (1 + spots.magnification)
+    for step in range(_STEPS):
+        tell(progress, step, _STEPS)
+        spots = replace(spots, values=values, sigma=profile * square**0.5)
+        floor = _MIN_BACKGROUND * values[..., 3] * pitch.prod(axis=1) / (np.pi * (radii**2 + 4 * spots.sigma**2))
+        values[..., 4] = np.maximum(values[..., 4], floor)
+        terms = (_normal_equations(spots, k, step < n_first) for k in range(len(values)))
+        slope, information, chi_square = map(np.array, zip(*terms, strict=True))
+        covariance = np.linalg.inv(information[..., :5, :5])
+        along = (covariance @ information[..., :5, 5:])[..., 0]  # changes of the values by the blur's square
+        score = slope[..., 5] - (along * slope[..., :5]).sum(axis=2)
+        gain = information[..., 5, 5] - (along * information[..., :5, 5]).sum(axis=2)
+        good = seen & (chi_square <= _MAX_CHI_SQUARE * np.median(chi_square[seen])) if seen.any() else seen
+        total = max(float(gain[good].sum()), 1e-30)
+        before, square = (
+            square,
+            float(np.clip(square + score[good].sum() / total, max(square / 4, limits[0]), limits[1])),
+        )
+        steps = (covariance @ slope[..., :5, None])[..., 0] - along * (square - before)
         # A step moves the centre by at most half a radius, and changes radius and counts by at most half.
-        scale = 0.5 * np.stack([*radius_in_pixels, values[2], values[3]]) / np.maximum(np.abs(step[:4]), 1e-30)
-        values += np.minimum(scale.min(axis=0), 1.0) * step
-        size[4] *= values[4] > 1.01 * floor  # a background at its limit cannot decrease further
-        if size.max() < _CONVERGED:
+        most = 0.5 * values[..., [2, 2, 2, 3]] / np.maximum(np.abs(steps[..., :4]), 1e-30)
+        values = values + steps * np.minimum(most.min(axis=2), 1.0)[..., None]
+        values[..., 2] = np.clip(values[..., 2], *(limit * radii for limit in _RADII))
+        size = np.abs(steps) / np.sqrt(covariance.diagonal(axis1=2, axis2=3))
+        size[..., 4] *= values[..., 4] > 1.01 * floor  # a background at its limit cannot decrease further
+        if step >= n_first and size[seen].max(initial=0.0) < _CONVERGED and abs(square - before) * total**0.5 < 0.1:
             break
-    values[4] = np.where(values[4] > 1.01 * floor, values[4], 0.0)
-    return values, covariance[:, :2, :2]
+    values[..., 4] = np.where(values[..., 4] > 1.01 * floor, values[..., 4], 0.0)
+    return replace(
+        spots, values=values, sigma=profile * square**0.5, covariance=covariance[..., :3, :3], score=score, gain=gain
+    )
+
+
+def _normal_equations(spots: Spots, k: int, holds_radius: bool) -> tuple[Floats, Floats, Floats]:
+    """Return the likelihood's slope (M, 6) by acquisition k's values and the blur's square, and the information (M, 6, 6).
+
+    The third array is chi-square per pixel (M,). With `holds_radius` the radii have no influence.
+    """
+    values, windows, known = spots.values[k], spots.windows[k], spots.background[k]
+    fractions, gradient = spots.model.fractions(
+        values[:, :2],
+        values[:, 2],
+        spots.sigma,
+        spots.magnification[k],
+        (known.shape[1], known.shape[2]),
+        spots.first[k],
+    )
+    counts, uniform = values.T[3:, :, None, None]
+    expected = counts * fractions + uniform + known
+    gradient[2] *= not holds_radius
+    gradient[3] *= (spots.sigma / (2 * spots.sigma.max() ** 2))[:, None, None]
+    gradient = np.stack([*counts * gradient[:3], fractions, np.ones_like(fractions), counts * gradient[3]], axis=1)
+    gradient = gradient.reshape(len(values), 6, -1)  # of the expected counts
+    weighted = gradient / expected.reshape(len(values), 1, -1)
+    information = weighted @ gradient.swapaxes(1, 2)
+    information += (1e-9 * information.diagonal(axis1=1, axis2=2) + 1e-30)[:, :, None] * np.eye(6)
+    slope = (weighted @ (windows - expected).reshape(len(values), -1, 1))[..., 0]
+    bright = np.maximum(expected, 1)
+    return slope, information, ((windows - expected) ** 2 / bright).sum((1, 2)) / (expected >= 1).sum((1, 2)).clip(1)

@@ -46,8 +46,8 @@ def _run(arguments: argparse.Namespace) -> None:
 
 def _record(calibration: mph.Calibration) -> dict[str, Any]:
     """Return the calibration as JSON: angles in rad, None for NaN."""
-    array_names = ("points", "covariance", "chi_square", "misfit", "used", "spread", "told", "detector_offset")
-    record = {name: _json_value(getattr(calibration, name).tolist()) for name in array_names}
+    fields = "points covariance chi_square misfit used spread told detector_offset blur blur_sd"
+    record = {name: _json_value(getattr(calibration, name).tolist()) for name in fields.split()}
     record |= {name: list(getattr(calibration, name)) for name in ("names", "misfitting", "gauge")}
     module_names = ("numbers", "centers", "tilt", "collimator_length")
     geometry = {name: getattr(calibration.system, name).tolist() for name in module_names}

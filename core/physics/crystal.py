@@ -70,7 +70,7 @@ def gaussian_blur(n: int, sigma: float, parts: int = 1) -> Floats:
     squares = np.arange(-reach, reach + 1) ** 2
     scale = -0.5 / max(width, 1e-3) ** 2
     total = np.exp(scale * squares).sum()
-    missing = (width**2 - squares @ np.exp(scale * squares) / total) / 2
+    missing = max(width**2 - squares @ np.exp(scale * squares) / total, 0.0) / 2
     sampled = np.where(abs(distance) <= reach, np.exp(scale * distance**2) / total, 0)
     kernel = np.convolve(sampled, [missing, 1 - 2 * missing, missing], "same")
     over_pixel = np.convolve(kernel, np.ones(parts))

@@ -89,7 +89,7 @@ def compare_with_optimum(problem, prior, subsets, iterations):
 @pytest.mark.long
 @pytest.mark.parametrize("prior", PRIORS, ids=lambda prior: type(prior).__name__)
 def test_it_ends_at_the_optimum(small, prior):
-    found, _ = compare_with_optimum(small, prior, 5, 40)
+    found, _ = compare_with_optimum(small, prior, 5, 60)
     assert (np.diff(found.objective[1:]) >= -1e-8 * np.abs(found.objective[2:])).all()
 
 

@@ -110,7 +110,7 @@ def test_subsets_have_the_images_of_the_whole():
 
 
 @pytest.mark.parametrize("parts", [1, 3])
-@pytest.mark.parametrize("sigma", [0.01, 0.2, 0.45, 0.7, 3.0])
+@pytest.mark.parametrize("sigma", [0.01, 0.2, 0.45, 0.7, 1.63, 3.0])
 def test_a_blur_has_its_variance(sigma, parts):
     """A row adds the blur's variance to a part's own, and keeps the counts; no weight is below 0."""
     n = 61

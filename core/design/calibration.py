@@ -336,11 +336,8 @@ def _with_known_sources(free: BundleAdjustment, are_points: bool, pairs: Indexes
     and are then not used, and which of four points or three lengths are wrong. These are left out. All of it is warned of.
     """
     bundle, points, n_k = replace(free, pairs=pairs, distances=lengths), free.points, len(free.points)
-    groups, labels, name = (
-        np.eye(len(pairs)) > 0,
-        [f"{i} to {j}" for i, j in pairs + 1],
-        "distances",
-    )  # that are right or wrong
+    groups, name = np.eye(len(pairs)) > 0, "distances"  # of lengths that are right or wrong together
+    labels = [f"{i} to {j}" for i, j in pairs + 1]
     if are_points:
         bundle, pairs = replace(free, fits_points=False), np.argwhere(np.triu(np.ones((n_k, n_k)), 1))
         lengths = np.linalg.norm(np.diff(points[pairs], axis=1)[:, 0], axis=1)

@@ -34,9 +34,7 @@ def warn_of_fit(spots: Spots, used: Bools, geometry: FittedGeometry, chi_square:
     """
     typical = float(np.nanmedian(chi_square)) if np.isfinite(chi_square).any() else 1.0
     if not _CHI_SQUARES[0] <= typical <= _CHI_SQUARES[1]:
-        causes = (
-            "the images are no counts but scaled, or the source, the holes' edge or the crystal are not the model's"
-        )
+        causes = "images that are no counts but scaled, or another source, edge or crystal than the model's"
         warn(f"calibrate: chi-square is {typical:.2g} in most modules, expected about 1: {causes}", 4)
     heights = np.einsum("mj,kmj->km", geometry.frames[:, 2], geometry.points[:, None] - geometry.centers)
     magnification = geometry.length / heights
@@ -53,11 +51,8 @@ def warn_of_fit(spots: Spots, used: Bools, geometry: FittedGeometry, chi_square:
     information = float((weights * squares**2).sum())
     slope = float((used * spots.score * squares).sum()) / max(information, 1e-30)
     if abs(slope) * information**0.5 > _SIGNIFICANT:
-        told, fitted = (
-            math.sqrt(max(0.0, 20 * x)) for x in (spots.model.source_variance, spots.model.source_variance + slope)
-        )
+        variances = spots.model.source_variance, max(0.0, spots.model.source_variance + slope)
+        told, fitted = (math.sqrt(20 * variance) for variance in variances)
         causes = f"sources are like balls of {fitted:.2g} mm instead of {told:g} mm (source_diameter)"
-        warn(
-            f"calibrate: the more the spots are magnified, the {'wider' if slope > 0 else 'sharper'} they are: {causes}",
-            4,
-        )
+        change = "wider" if slope > 0 else "sharper"
+        warn(f"calibrate: the more the spots are magnified, the {change} they are: {causes}", 4)

@@ -184,10 +184,8 @@ def _maximize_likelihood(spots: Spots, n_first: int, progress: Progress | None) 
         gain = information[..., 5, 5] - (along * information[..., :5, 5]).sum(axis=2)
         good = seen & (chi_square <= _MAX_CHI_SQUARE * np.median(chi_square[seen])) if seen.any() else seen
         total = max(float(gain[good].sum()), 1e-30)
-        before, square = (
-            square,
-            float(np.clip(square + score[good].sum() / total, max(square / 4, limits[0]), limits[1])),
-        )
+        best, before = square + float(score[good].sum()) / total, square
+        square = min(max(best, square / 4, limits[0]), limits[1])
         steps = (covariance @ slope[..., :5, None])[..., 0] - along * (square - before)
         # A step moves the centre by at most half a radius, and changes radius and counts by at most half.
         most = 0.5 * values[..., [2, 2, 2, 3]] / np.maximum(np.abs(steps[..., :4]), 1e-30)
@@ -209,14 +207,9 @@ def _normal_equations(spots: Spots, k: int, holds_radius: bool) -> tuple[Floats,
     The third array is chi-square per pixel (M,). With `holds_radius` the radii have no influence.
     """
     values, windows, known = spots.values[k], spots.windows[k], spots.background[k]
-    fractions, gradient = spots.model.fractions(
-        values[:, :2],
-        values[:, 2],
-        spots.sigma,
-        spots.magnification[k],
-        (known.shape[1], known.shape[2]),
-        spots.first[k],
-    )
+    shape, magnification = (known.shape[1], known.shape[2]), spots.magnification[k]
+    found = spots.model.fractions(values[:, :2], values[:, 2], spots.sigma, magnification, shape, spots.first[k])
+    fractions, gradient = found
     counts, uniform = values.T[3:, :, None, None]
     expected = counts * fractions + uniform + known
     gradient[2] *= not holds_radius

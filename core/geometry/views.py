@@ -59,7 +59,7 @@ class Views:
         return replace(self, **{name: getattr(self, name)[chosen] for name in VECTORS})
 
     def finer(self, parts: int) -> Views:
-        """Return the views with pixels of one `parts`th of the sides, of the same images."""
+        """Return the views of the same images with pixels whose sides are divided into a number of `parts`."""
         n_v, n_u = self.shape
         shape = parts * n_v, parts * n_u
         return replace(self, u_steps=self.u_steps / parts, v_steps=self.v_steps / parts, shape=shape)

@@ -158,8 +158,7 @@ def whole_in_file(value: Any, name: str, least: int = 0, most: int | None = None
         is_valid = False
     if not is_valid:
         limit = "" if most is None else f" to {most}"
-        text = value.decode("latin-1") if isinstance(value, bytes) else str(value)
-        raise InputError(f"{name} = {text:.40}: expected a whole number from {least}{limit}")
+        raise InputError(f"{name} = {value!s:.40}: expected a whole number from {least}{limit}")
     return int(number)
 
 

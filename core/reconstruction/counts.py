@@ -151,10 +151,10 @@ class CountLoop(Loop):
         if support.all() or not support.any():
             return
         seen = np.asarray(self._A(support.astype(np.float32), self.preparing()))
-        beside = self.data.counts[seen <= _UNSEEN * seen.max()].sum(dtype=float)
-        excess = beside - self.data.background[seen <= _UNSEEN * seen.max()].sum(dtype=float)
-        share = excess / max(1.0, float((self.data.counts - self.data.background).sum(dtype=float)))
-        if share > 0.01 and excess > 3 * np.sqrt(beside):
+        unseen, excesses = seen <= _UNSEEN * seen.max(), self.data.counts - self.data.background
+        excess = excesses[unseen].sum(dtype=float)
+        share = excess / max(1.0, excesses.sum(dtype=float))
+        if share > 0.01 and excess > 3 * np.sqrt(self.data.counts[unseen].sum(dtype=float)):  # more than chance
             text = f"{100 * share:.3g} % of the counts are in pixels that see no voxel of them above 0"
             warn(f"mask, start: {text}: activity outside, or a background that is not given?", 5)
 

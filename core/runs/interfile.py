@@ -50,7 +50,7 @@ def read(path: Path) -> FileFrames:
     number_type = np.dtype((">" if byte_order == "BIGENDIAN" else "<") + letter + str(n_bytes))
     frame_size = rows * columns * n_bytes
     offset = header.whole("data offset in bytes", 2048 * header.whole("data starting block", 0))
-    n_frames = header.whole("total number of images", max(1, (header.n_bytes - offset) // frame_size))
+    n_frames = header.whole("total number of images", max(1, (header.data_size - offset) // frame_size))
     frames = file_numbers(header.data_path, number_type, (n_frames, rows, columns), offset)
     n_windows = header.whole("number of energy windows", 1)
     if n_frames % n_windows:
@@ -79,7 +79,7 @@ class _Header:
             if assigned and not line.lstrip().startswith(";"):
                 self.values.setdefault(key, []).append(value.strip())
         self.data_path = _data_file(path, self.text("name of data file"))
-        self.n_bytes = max(1, self.data_path.stat().st_size)
+        self.data_size = max(1, self.data_path.stat().st_size)
 
     def all(self, key: str) -> list[str]:
         """Return the values of a key and of the key with numbers, ``key [1]``, ``key [2]``; empty ones are left out."""
@@ -104,7 +104,7 @@ class _Header:
             if default is None:
                 raise InputError(f"it has no {key!r}")
             return default
-        number = whole_in_file(text, key, 1 if default is None else 0, self.n_bytes)
+        number = whole_in_file(text, key, 1 if default is None else 0, self.data_size)
         return number if number or default is None else default
 
     def pixel_size(self, axis: int) -> float:

@@ -67,18 +67,17 @@ def share_outside(volume: Volume, grid: Grid) -> float:
     Values are weighed by their difference from those outside of volumes, such as air's CT number. An empty volume gives 0.
     """
     index = grid.index_from_world @ volume.grid.affine  # index in `grid` from the volume's
-    limits, total, outside = np.array(grid.shape) - 0.5 + _EDGE, 0.0, 0.0
+    low, high, sums = -0.5 - _EDGE, np.array(grid.shape) - 0.5 + _EDGE, np.zeros(2)
     corners = moved(grid.index_from_world, volume.grid.corners())
-    if (corners >= -0.5 - _EDGE).all() and (corners <= limits).all():
+    if (corners >= low).all() and (corners <= high).all():
         return 0.0
-    y, z = np.meshgrid(*map(np.arange, volume.grid.shape[1:]), indexing="ij")
+    cells = np.indices(volume.grid.shape[1:]).reshape(2, -1)
     for x, plane in enumerate(volume.array):
-        values = np.abs(plane - np.float32(outside_value(volume)))
-        at = [row[0] * x + row[1] * y + row[2] * z + row[3] for row in index[:3]]
-        is_inside = np.logical_and.reduce([(c > -0.5 - _EDGE) & (c < n) for c, n in zip(at, limits, strict=True)])
-        total += float(values.sum(dtype=float))
-        outside += float(values[~is_inside].sum(dtype=float))
-    return outside / total if total else 0.0
+        values = np.abs(plane.ravel() - np.float32(outside_value(volume)))
+        centres = index[:3, 1:3] @ cells + index[:3, :1] * x + index[:3, 3:]
+        is_outside = ((centres < low) | (centres > high[:, None])).any(axis=0)
+        sums += values.sum(dtype=float), values[is_outside].sum(dtype=float)
+    return float(sums[1] / sums[0]) if sums[0] else 0.0
 
 
 def outside_warnings(volume: Volume, grid: Grid, place: str, effect: str, limit: float = 0.01) -> Iterator[str]:

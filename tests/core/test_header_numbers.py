@@ -220,6 +220,12 @@ def test_a_number_that_drives_a_loop_or_memory_is_refused_at_once(tmp_path, read
         assert seconds < SECONDS and peak < BYTES, (value, seconds, peak)
 
 
+def test_bytes_and_lines_before_the_numbers_may_be_more_than_the_headers(tmp_path):
+    (tmp_path / "f.nhdr").write_text(NRRD.replace("byte skip: 0", "byte skip: 5000"))
+    (tmp_path / "f.raw").write_bytes(bytes(5000) + FRAMES.tobytes())
+    np.testing.assert_array_equal(mph.read_volume(tmp_path / "f.nhdr", "activity").array, FRAMES.transpose(2, 1, 0))
+
+
 def test_an_hdf5_array_without_its_numbers_is_refused_at_once(tmp_path):
     with h5py.File(tmp_path / "f.h5", "w") as file:
         file.create_dataset("array", (999999999999, 3, 4), "u2", chunks=(64, 3, 4)).attrs["quantity"] = "activity"

@@ -65,9 +65,7 @@ def require_voxels(shape: Sequence[int], dtype: np.dtype[Any], n_held: float = m
         raise InputError(f"expected real numbers, found {dtype}")
     n_voxels = math.prod(int(n) for n in shape)
     if dtype.itemsize * n_voxels > n_held:
-        raise InputError(
-            f"expected {dtype.itemsize * n_voxels} bytes of {sizes} voxels, the file can hold {n_held:.0f}"
-        )
+        raise InputError(f"expected {sizes} voxels of {dtype.itemsize} bytes, the file can hold {n_held:.0f} bytes")
     # Bytes of the file's values, of their float32 copy, and of the check that they are finite.
     require((4.5 + dtype.itemsize) * n_voxels, f"a volume of {sizes} voxels")
 

@@ -34,7 +34,9 @@ def read(path: Path) -> VolumeFileContents:
     """Read a .mha file, or a .mhd file and the file with its voxels."""
     with open(path, "rb") as file:
         header = _read_header(file)
-        shape = tuple(whole_in_file(number, "DimSize", 1, _MOST_VOXELS) for number in header.get("DimSize", "").split())
+        if "DimSize" not in header:
+            raise InputError("it has no DimSize")
+        shape = tuple(whole_in_file(number, "DimSize", 1, _MOST_VOXELS) for number in header["DimSize"].split())
         whole_in_file(header.get("NDims", len(shape)), "NDims", len(shape), len(shape))
         if len(shape) == 4 and shape[3] == 1:  # one volume
             shape = shape[:3]

@@ -59,10 +59,8 @@ def read(path: Path) -> VolumeFileContents:
     for name in ("type", "sizes"):
         if name not in header:
             raise InputError(f"it has no field {name}: it is damaged or ends early")
-    for name in ("line skip", "byte skip"):
-        whole_in_file(header.get(name, 0), name, -(name == "byte skip"), path.stat().st_size)
     with open(path, "rb") as file:  # pynrrd rounds sizes
-        sizes_line = re.search(rb"(?m)^sizes:(.*)", file.read(_LONGEST_HEADER))
+        sizes_line = re.search(r"(?m)^sizes:(.*)", file.read(_LONGEST_HEADER).decode("latin-1"))
     for size in sizes_line[1].split() if sizes_line else ():
         whole_in_file(size, "sizes", 1)
     single = _single_axis(header)
@@ -76,8 +74,11 @@ def read(path: Path) -> VolumeFileContents:
         raise InputError("old min and old max: quantized values are not read; unquantize them (unu unquantize)")
     data_file = header.get("data file", "")
     require_one_data_file("data file:", data_file)
-    if data_file and (path.parent / data_file).exists():
-        require_file(path.parent / data_file)
+    data_path = path.parent / data_file if data_file else path
+    if data_path.exists():
+        n_bytes = require_file(data_path).stat().st_size
+        for name in ("line skip", "byte skip"):
+            whole_in_file(header.get(name, 0), name, -(name == "byte skip"), n_bytes)
     affine = _affine(header, path)
     try:
         array, _ = nrrd.read(str(path))

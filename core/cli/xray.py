@@ -5,6 +5,8 @@ import argparse
 import numpy as np
 
 from ... import core as mph
+from ..errors import warn
+from ..volumes.resampling import outside_warnings
 from ..volumes.volume_files import VOLUME_FORMATS
 from .options import add_actions, add_run, describe_volume, output_path, print_answer
 from .scanners import add_workbook
@@ -81,7 +83,10 @@ def _dose(arguments: argparse.Namespace) -> None:
     path = output_path(arguments.output, VOLUME_FORMATS)
     activity, density = mph.read_volume(arguments.activity, "activity"), None
     if arguments.ct:
-        hu = mph.resample(mph.read_volume(arguments.ct, "hu"), activity.grid)
+        ct = mph.read_volume(arguments.ct, "hu")
+        for text in outside_warnings(activity, ct.grid, "the CT", "where its density is taken as air's"):
+            warn(text)
+        hu = mph.resample(ct, activity.grid)
         density = np.maximum(1 + hu.array / 1000, _LEAST_DENSITY)
     dose = mph.absorbed_dose_rate(activity, arguments.isotope, density)
     if not arguments.rate:

@@ -9,6 +9,7 @@ import numpy as np
 from ..errors import InputError, naming
 from ..files import AnyPath
 from ..geometry.system import PinholeSystem
+from ..geometry.views import VECTORS
 from ..models.emission import Emission
 from ..progress import Progress
 from ..recipes.settings import Setting, settings_by_key
@@ -16,9 +17,10 @@ from ..recipes.tables import flat_entries, read_table, require_value
 from ..recipes.toml import read_toml
 from ..recipes.values import Values
 from ..runs.files import read_run
+from ..runs.run import ProjectionRun
 from ..runs.run_recipe import recipe_model
 from ..runs.settings import SETTINGS
-from ..validation import at_least_0, real_array
+from ..validation import at_least_0, real_array, shape_text
 from ..workbook import read_system
 from .bundle import LENGTH, OFFSET
 from .calibration import Calibration, calibrate
@@ -69,8 +71,10 @@ def run_calibration(path: AnyPath, progress: Progress | None = None) -> Calibrat
         if not isinstance(system, PinholeSystem) or not isinstance(model, Emission):
             raise InputError("runs.files: expected runs of counts of pinholes")
         for name, run in zip(files, runs, strict=True):
-            if run.projections.shape != runs[0].projections.shape or not _have_same_poses(run.system, system):
+            if not _have_same_poses(run.system, system):
                 raise InputError(f"runs.files: {name}: expected the modules of {workbook or files[0]}")
+            if difference := _view_difference(run, runs[0]):
+                raise InputError(f"runs.files: {name}: {difference} in {files[0]}; expected the same views in all runs")
         diameter = at_least_0(sources.get("diameter", 0.0), "sources.diameter", "mm")
         priors = {key.partition(".")[2]: recipe[key] for key in _ROWS if key.startswith("priors.")}
         return calibrate(
@@ -84,6 +88,21 @@ def run_calibration(path: AnyPath, progress: Progress | None = None) -> Calibrat
 def _have_same_poses(a: Any, b: Any) -> bool:
     """Return whether two scanners have the same modules at the same poses."""
     return len(a) == len(b) and np.allclose(a.poses(), b.poses(), atol=1e-6)
+
+
+def _view_difference(run: ProjectionRun, first: ProjectionRun) -> str:
+    """Return in what the views of two runs of the same modules differ, such as "48 x 48 pixels, but 24 x 24"; else ""."""
+    facts = []
+    for views, settings in ((run.views, run.settings), (first.views, first.settings)):
+        magnification = float(settings.get("magnification", 1.0))
+        sizes = [f"{np.linalg.norm(steps[0]) / magnification:.4g}" for steps in (views.u_steps, views.v_steps)]
+        facts.append((
+            f"the {settings.get('detector')} detector", f"{shape_text(views.shape)} pixels",
+            f"magnification {magnification:g}", f"pixels of {' x '.join(sizes)} mm",
+        ))  # fmt: skip
+    texts = [f"{own}, but {other}" for own, other in zip(*facts, strict=True) if own != other]
+    is_same = all(np.allclose(getattr(run.views, name), getattr(first.views, name), atol=1e-6) for name in VECTORS)
+    return texts[0] if texts else "" if is_same else "its pixels lie elsewhere than"
 
 
 def _distance_table(entries: Any, n_k: int) -> Any:

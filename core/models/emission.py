@@ -458,7 +458,7 @@ class Emission(Model):
         return emission_warnings.mu_warnings(mu, self)
 
     def image_warnings(self, volume: Volume, views: Views) -> Iterator[str]:
-        """Yield a warning of activity below 0, and of images that reach beyond the crystals."""
+        """Yield a warning of activity below 0 or outside maps of mu, and of images that reach beyond the crystals."""
         return emission_warnings.image_warnings(volume, views, self)
 
     def pixel_points_needed(self, views: Views, m: int, grid: Grid) -> int:

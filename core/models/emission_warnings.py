@@ -13,7 +13,9 @@ from ..geometry.collimator import Construction
 from ..geometry.grid import Grid
 from ..geometry.views import Views
 from ..physics.materials import APERTURES, attenuation
+from ..volumes.resampling import outside_warnings
 from ..volumes.volume import Volume
+from .photon_lines import mu_volumes
 from .pixel_points import expected_error, shadow_edges
 
 _LARGEST_PLATE_SHARE = 0.005
@@ -59,10 +61,11 @@ def mu_warnings(mu: Floats32, model: Any) -> Iterator[str]:
 
 
 def image_warnings(volume: Volume, views: Views, model: Any) -> Iterator[str]:
-    """Yield a warning of activity below 0, and of images that reach beyond the crystals."""
+    """Yield a warning of activity below 0, of activity outside maps of mu, and of images that reach beyond the crystals."""
     lowest, highest = float(volume.array.min()), float(volume.array.max())
     if lowest < -0.1 * abs(highest):  # interpolation leaves smaller values below 0
         yield f"the activity is {lowest:g} to {highest:g} kBq/mL: what is below 0 makes counts below 0"
+    yield from map_warnings(volume, model)
     if model.within_crystal:
         return
     system = model.system
@@ -74,6 +77,12 @@ def image_warnings(volume: Volume, views: Views, model: Any) -> Iterator[str]:
             f"{beyond} of {len(views)} images are wider than the crystal: pixels beside it count photons that nothing "
             "detects, unless within_crystal (Crystal's Side) leaves them out"
         )
+
+
+def map_warnings(volume: Volume, model: Any, limit: float = 0.01) -> Iterator[str]:
+    """Yield a warning if more than the share `limit` of an activity is outside the model's maps of mu."""
+    for grid in dict.fromkeys(mu.grid for mu in mu_volumes(getattr(model, "mu", None))):
+        yield from outside_warnings(volume, grid, "the map of mu", "where nothing attenuates its photons", limit)
 
 
 def ray_caution(model: Any, views: Views, grid: Grid) -> str | None:

@@ -19,6 +19,7 @@ from .priors import Prior, make_penalty
 NEGLIGIBLE = np.float32(1e-30)
 """Divisor at or below which a quotient is left out, because float32 could not hold it."""
 
+_UNSEEN = 1e-3  # share of the brightest pixel's counts up to which a pixel sees nothing
 _CERTAIN_GAIN, _CERTAIN_SHARE = 30.0, 0.015
 """Gain of log-likelihood that chance cannot explain, and the share of the counts that a coarse model cannot explain."""
 
@@ -136,10 +137,26 @@ class CountLoop(Loop):
         ones = ((projector, np.ones(projector.shape_out, np.float32)) for projector in projectors)
         self.sensitivities = [np.asarray(projector.T(image, self.preparing()), np.float32) for projector, image in ones]
         self.sensitivity: Array = sum(self.sensitivities[1:], self.sensitivities[0])
+        if not self._resumed:
+            self._warn_of_unexplained(
+                self.mask if method == "BSREM" else self.values > 0
+            )  # zeros stay in other methods
         self.visible = self.mask & (self.sensitivity > NEGLIGIBLE)
         self.prior, self.penalty = prior, make_penalty(prior, A.grid, self.visible)
         self._images: Array | None = None  # of the volume in the last call of `objective`
         self.last_objective = -np.inf
+
+    def _warn_of_unexplained(self, support: Array) -> None:
+        """Warn of counts in pixels that do not see the `support`, the voxels that mask and start leave above 0."""
+        if support.all() or not support.any():
+            return
+        seen = np.asarray(self._A(support.astype(np.float32), self.preparing()))
+        unseen, excesses = seen <= _UNSEEN * seen.max(), self.data.counts - self.data.background
+        excess = excesses[unseen].sum(dtype=float)
+        share = excess / max(1.0, excesses.sum(dtype=float))
+        if share > 0.01 and excess > 3 * np.sqrt(self.data.counts[unseen].sum(dtype=float)):  # more than chance
+            text = f"{100 * share:.3g} % of the counts are in pixels that see no voxel of them above 0"
+            warn(f"mask, start: {text}: activity outside, or a background that is not given?", 5)
 
     def images(self, s: int, values: Array, progress: Progress | None) -> Array:
         """Return the images of a volume in subset `s`; those of the last iteration's volume are not computed again."""

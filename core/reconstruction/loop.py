@@ -210,6 +210,9 @@ class Loop:
         values = real_array(array, "start", self._A.shape_in, np.float32)
         if not negative and values.min() < 0:
             raise InputError(f"start: expected 0 or more, got {values.min():g}")
+        sums = [float(np.abs(array).sum(dtype=float)) for array in (values[~self.mask], values)]
+        if sums[0] > 0.01 * sums[1]:
+            warn(f"start: {100 * sums[0] / sums[1]:.3g} % of its sum lies outside the mask, and is left out", 5)
         return self._masked(values)
 
     def _masked(self, values: Array) -> Array:

@@ -18,7 +18,7 @@ from ..files import AnyPath, require_file
 from ..hdf5 import datasets, opened, read_numbers
 from ..progress import Progress, tell
 from ..recording import recorded_warnings
-from ..validation import one_of, whole_shape
+from ..validation import one_of, whole_in_file, whole_shape
 from ..volumes.formats import metaimage, numpy_files
 from ..volumes.formats.dicom import is_dicom
 from . import interfile, nuclear_medicine
@@ -157,6 +157,8 @@ def _checked_frames(frames: FileFrames) -> Counts:
     for column, name in ((0, "time"), (3, "window"), (4, "start"), (5, "low"), (6, "high")):
         values = np.array(frames.facts.get(name) or [math.nan])
         counts.about[:, column] = values[np.arange(len(array)) * len(values) // len(array)]
+    for low, high in counts.about[counts.about[:, 5] > counts.about[:, 6], 5:]:
+        raise InputError(f"energy window from {low:g} to {high:g} keV: expected the lower level first")
     return counts
 
 
@@ -166,8 +168,10 @@ def _read_raw(path: Path, shape: Any, raw_type: str | None, big_endian: bool) ->
         missing = "shape (--raw-shape FRAMES ROWS COLUMNS)" if shape is None else "type (--raw-type, uint16 or so)"
         raise InputError(f"raw numbers need their {missing}")
     one_of(raw_type, RAW_TYPES, "raw type")
+    for size in (shape := whole_shape(shape, "raw shape (--raw-shape)", 3)):
+        whole_in_file(size, "raw shape (--raw-shape)", 1, max(1, path.stat().st_size))
     number_type = np.dtype(raw_type).newbyteorder(">" if big_endian else "<")
-    return file_numbers(path, number_type, whole_shape(shape, "raw shape (--raw-shape)", 3))
+    return file_numbers(path, number_type, shape)
 
 
 def _read_numpy(path: Path, dataset: str | None = None) -> FileFrames:

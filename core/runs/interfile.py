@@ -15,6 +15,7 @@ import numpy as np
 from ..arrays import Floats
 from ..errors import InputError
 from ..files import require_file
+from ..validation import whole_in_file
 from .frame_facts import FileFrames, file_numbers, rescaled
 from .stated_times import DAY, moment, stated_duration, stated_number
 
@@ -47,10 +48,10 @@ def read(path: Path) -> FileFrames:
     if n_bytes > 1 and byte_order not in ("LITTLEENDIAN", "BIGENDIAN"):
         raise InputError(f"imagedata byte order {byte_order or 'missing'}: expected LITTLEENDIAN or BIGENDIAN")
     number_type = np.dtype((">" if byte_order == "BIGENDIAN" else "<") + letter + str(n_bytes))
-    data_path, frame_size = _data_file(path, header.text("name of data file")), rows * columns * n_bytes
-    offset = header.whole("data offset in bytes", 2048 * header.whole("data starting block", 0, 0), 0)
-    n_frames = header.whole("total number of images", max(1, (data_path.stat().st_size - offset) // frame_size))
-    frames = file_numbers(data_path, number_type, (n_frames, rows, columns), offset)
+    frame_size = rows * columns * n_bytes
+    offset = header.whole("data offset in bytes", 2048 * header.whole("data starting block", 0))
+    n_frames = header.whole("total number of images", max(1, (header.data_size - offset) // frame_size))
+    frames = file_numbers(header.data_path, number_type, (n_frames, rows, columns), offset)
     n_windows = header.whole("number of energy windows", 1)
     if n_frames % n_windows:
         raise InputError(f"number of energy windows = {n_windows}: expected one that divides the {n_frames} images")
@@ -77,6 +78,8 @@ class _Header:
             key = " ".join(key.strip().lstrip("!").lower().replace("[", " [").split())
             if assigned and not line.lstrip().startswith(";"):
                 self.values.setdefault(key, []).append(value.strip())
+        self.data_path = _data_file(path, self.text("name of data file"))
+        self.data_size = max(1, self.data_path.stat().st_size)
 
     def all(self, key: str) -> list[str]:
         """Return the values of a key and of the key with numbers, ``key [1]``, ``key [2]``; empty ones are left out."""
@@ -94,17 +97,15 @@ class _Header:
         """Return the pause, s, of each frame group; 0 for one that the header does not state."""
         return _in_blocks([stated_number(text, key, default=0.0) for text in self.all(key)] or [0.0], [], n_groups, key)
 
-    def whole(self, key: str, default: int | None = None, least: int = 1) -> int:
-        """Return the whole number of a key, at least `least`, or the default where the header says none."""
+    def whole(self, key: str, default: int | None = None) -> int:
+        """Return the whole number of a key, at most the bytes of the data; the default where the header says 0 or none."""
         text = self.text(key)
-        number = stated_number(text, key, "a whole number")
-        if math.isnan(number) or (number == 0 and default is not None):
+        if text.lower() != "nan" and math.isnan(stated_number(text, key, "a whole number")):
             if default is None:
                 raise InputError(f"it has no {key!r}")
             return default
-        if number < least or number != int(number):
-            raise InputError(f"{key} = {text}: expected a whole number from {least}")
-        return int(number)
+        number = whole_in_file(text, key, 1 if default is None else 0, self.data_size)
+        return number if number or default is None else default
 
     def pixel_size(self, axis: int) -> float:
         """Return the size of a pixel along axis 1 or 2, mm; NaN where the header says none."""
@@ -148,8 +149,8 @@ def _in_blocks(values: list[float], sizes: list[int], n_frames: int, key: str) -
     Blocks of which the sizes add up to a part of the frames are repeated, as in each energy window.
     """
     if sizes and len(sizes) == len(values):
-        in_part = [value for value, size in zip(values, sizes, strict=True) for _ in range(size)]
-        if n_frames % len(in_part) == 0:
+        if n_frames % sum(sizes) == 0:
+            in_part = [value for value, size in zip(values, sizes, strict=True) for _ in range(size)]
             return in_part * (n_frames // len(in_part))
         raise InputError(f"groups of {' + '.join(map(str, sizes))} images: expected them to make up {n_frames} images")
     if not values or n_frames % len(values):
@@ -162,7 +163,7 @@ def _times(header: _Header, n_frames: int) -> tuple[list[float], list[float]]:
     is_gated = any(key.startswith(("gated", "gspect", "number of images in time window")) for key in header.values)
     is_gated |= "gated" in header.text("type of data").lower()
     size_key = "number of images in time window" if is_gated else "number of images this frame group"
-    sizes = [int(stated_number(text, size_key, "a whole number")) for text in header.all(size_key)]
+    sizes = [whole_in_file(text, size_key, 1, n_frames) for text in header.all(size_key)]
     for key in _EXPOSURES[1:2] if is_gated else _EXPOSURES:
         durations = [stated_duration(text, key) for text in header.all(key)]
         if any(map(math.isfinite, durations)):

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import InputError
-from ..volumes.formats.dicom import TOMOGRAMS, decode_pixels, image_kind, require_grey, stated_rescaling
+from ..volumes.formats.dicom import TOMOGRAMS, decode_pixels, image_kind, require_grey, stated_count, stated_rescaling
 from ..volumes.formats.dicom_units import RealWorldValues, real_world_values, unit_of
 from .frame_facts import FileFrames, require_memory, rescaled
 from .stated_times import moment, stated_duration
@@ -26,11 +26,11 @@ def read(path: Path) -> FileFrames:
     if image_kind(dataset) in TOMOGRAMS or "SliceVector" in dataset:
         raise InputError("it holds a reconstructed tomogram; expected a frame a module")
     require_grey(dataset)
-    shape = int(dataset.get("NumberOfFrames") or 1), int(dataset.Rows), int(dataset.Columns)
+    shape = stated_count(dataset, "NumberOfFrames"), int(dataset.Rows), int(dataset.Columns)
     require_memory(shape, 4)
     slope, intercept, *_ = _values(dataset)
     frames = rescaled(decode_pixels(dataset).reshape(shape), slope, intercept)
-    vector_sizes = {name: int(dataset.get(f"NumberOf{name.replace(' ', '')}s") or 1) for name in _VECTORS}
+    vector_sizes = {name: stated_count(dataset, f"NumberOf{name.replace(' ', '')}s") for name in _VECTORS}
     content = ", ".join(f"{n} {name.lower()}s" for name, n in vector_sizes.items() if n > 1)
     pixel = [float(size) for size in dataset.get("PixelSpacing") or (math.nan, math.nan)][::-1]
     windows = _numbers_of_frames(dataset, "Energy Window", vector_sizes["Energy Window"])
@@ -113,7 +113,7 @@ def _starts(data: Any, n_frames: int) -> list[float]:
         duration, pause = _frame_duration(phase), float(phase.get("PauseBetweenFrames") or 0) / 1000
         phase_starts.append(phase_end + float(phase.get("PhaseDelay") or 0) / 1000)
         frame_steps.append(duration + pause)
-        phase_end = phase_starts[-1] + int(phase.get("NumberOfFramesInPhase") or 1) * frame_steps[-1] - pause
+        phase_end = phase_starts[-1] + stated_count(phase, "NumberOfFramesInPhase") * frame_steps[-1] - pause
     slices = data.get("TimeSliceVector")
     numbers = [1] * n_frames if slices is None else list(slices)  # of the frames in their phases
     frames = zip(_numbers_of_frames(data, "Phase", len(phases)), numbers, strict=False)

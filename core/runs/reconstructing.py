@@ -12,6 +12,7 @@ from ..errors import InputError, warn
 from ..geometry.grid import Grid
 from ..geometry.system import PinholeSystem
 from ..memory import require
+from ..models.emission_warnings import map_warnings
 from ..models.photon_lines import Mu
 from ..phantoms.derenzo import DerenzoRods
 from ..phantoms.settings import setting_names
@@ -40,6 +41,8 @@ It gets the volume's values, and the objective after each iteration so far; if i
 
 _FEWEST, _MOST = 64, 128
 """Smallest and largest default number of voxels along a side of the ROI's cube."""
+_OUTSIDE_MAPS = 0.1
+"""Share of a reconstruction outside the map of mu above which it is warned of: noise in the air is less."""
 _POINTS = 7
 """Points of the hole that model its blur, few enough for an iteration in a fraction of a second."""
 
@@ -119,6 +122,8 @@ def reconstruct_run(
     arguments |= {name: value for name, value in common.items() if method.takes(name)}
     result = method.function(A, line_integrals(run, recipe), **arguments)
     volume = result.volume
+    for text in map_warnings(volume, A.model, _OUTSIDE_MAPS):
+        warn(text, 2)
     if run.volume is not None:  # the quantity of a radiograph's volume is not activity
         volume = Volume(volume.array, grid, run.volume.quantity, volume.note)
     flatters = [*result.settings.get("flatters", ()), *flatters]

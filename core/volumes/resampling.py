@@ -1,12 +1,13 @@
 """Resampling of volumes onto other grids, by interpolation or as means."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import numpy as np
 
 from ..arrays import Floats, Floats32, Integers
 from ..errors import InputError
-from ..geometry.grid import Grid
+from ..geometry.frames import moved
+from ..geometry.grid import Grid, same_grid
 from ..memory import require
 from ..progress import Progress
 from ..validation import freeze, instance, real_array
@@ -15,6 +16,7 @@ from .volume import Volume, outside_value
 _Stencil = tuple[Integers, Floats32]
 """Interpolation along one axis: indices of the old grid and their weights, each (N, k) for N positions."""
 
+_EDGE = 1e-4  # voxels by which a centre on a box's face may lie outside by rounding
 _PARALLEL = 1e-9  # voxels per voxel: axes that deviate by less are parallel
 _SLAB = 1 << 20  # samples computed at a time
 
@@ -57,6 +59,34 @@ def resample(
     fill(array, index_from_index, method, result, progress or (lambda done, total: None))
     result += background
     return Volume(freeze(result), grid, volume.quantity)
+
+
+def share_outside(volume: Volume, grid: Grid) -> float:
+    """Return the share of a volume's sum that is in voxels whose centres are outside the box of `grid`.
+
+    Values are weighed by their difference from those outside of volumes, such as air's CT number. An empty volume gives 0.
+    """
+    index = grid.index_from_world @ volume.grid.affine  # index in `grid` from the volume's
+    low, high, sums = -0.5 - _EDGE, np.array(grid.shape) - 0.5 + _EDGE, np.zeros(2)
+    corners = moved(grid.index_from_world, volume.grid.corners())
+    if (corners >= low).all() and (corners <= high).all():
+        return 0.0
+    cells = np.indices(volume.grid.shape[1:]).reshape(2, -1)
+    for x, plane in enumerate(volume.array):
+        values = np.abs(plane.ravel() - np.float32(outside_value(volume)))
+        centres = index[:3, 1:3] @ cells + index[:3, :1] * x + index[:3, 3:]
+        is_outside = ((centres < low) | (centres > high[:, None])).any(axis=0)
+        sums += values.sum(dtype=float), values[is_outside].sum(dtype=float)
+    return float(sums[1] / sums[0]) if sums[0] else 0.0
+
+
+def outside_warnings(volume: Volume, grid: Grid, place: str, effect: str, limit: float = 0.01) -> Iterator[str]:
+    """Yield a warning if more than the share `limit` of a volume is outside the box of `grid`.
+
+    `place` is what the grid is of, and `effect` what becomes of the values outside it.
+    """
+    if not same_grid(volume.grid, grid) and (share := share_outside(volume, grid)) > limit:
+        yield f"{100 * share:.3g} % of the {volume.quantity} lies outside {place}, {effect}: check where both lie"
 
 
 def values_at(volume: Volume, points: Floats, method: str = "linear") -> Floats32:

@@ -18,6 +18,8 @@ from mphdrr.core.design import calibration_recipe
 from mphdrr.core.design.bundle import BundleAdjustment
 from mphdrr.core.geometry.frames import affine_matrix
 
+from .conftest import refused
+
 SHAPE = (48, 48)
 PHYSICS = {"intrinsic_fwhm": 2.0}
 
@@ -299,6 +301,31 @@ def test_a_recipe_says_the_source_and_the_physics(recipe, monkeypatch):
     model = options["model"]
     assert options["source_diameter"] == 2 and model.depth_layers == 5 and np.allclose(model.crystal_mu, 0.4)
     assert model.intrinsic_fwhm == 2 and model.system.detector_thickness[0] == 10
+
+
+@pytest.mark.parametrize(
+    ("changes", "difference"),
+    [
+        ({"counts": 24}, "24 x 24 pixels, but 48 x 48 pixels"),
+        ({"detector": "virtual"}, "the virtual detector, but the real detector"),
+        ({"magnification": 5.0}, "magnification 5, but magnification 10"),
+        ({"pitch": 1.1}, "pixels of 1.1 x 1.1 mm, but pixels of "),
+        ({}, "its pixels lie elsewhere than in point0.h5"),
+    ],
+)
+@pytest.mark.filterwarnings("ignore")
+def test_a_run_with_other_views_is_refused_by_its_name(recipe, monkeypatch, changes, difference):
+    path, measured = recipe
+    monkeypatch.setattr(calibration_recipe, "calibrate", lambda *images, **options: None)
+    calibration_recipe.run_calibration(path)
+    some, name = measured.nominal, path.with_name("point3.h5")
+    counts, model = np.ones((len(some), *[changes.get("counts", 48)] * 2), int), mph.read_run(name).recipe
+    options = {"recipe": model} | {key: value for key, value in changes.items() if key != "counts"}
+    run = mph.counts_run(counts, some, some.numbers.tolist(), "back-v", 60.0, **options)
+    if not changes:
+        run = replace(run, views=some.views((48, 48), "real", offset=(0.5, 0.0)))
+    mph.write_run(run, name)
+    refused(lambda: calibration_recipe.run_calibration(path), "points.toml: runs.files: point3.h5: " + difference)
 
 
 @pytest.mark.parametrize(

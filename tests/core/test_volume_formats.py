@@ -497,7 +497,7 @@ BAD = {
     "no archive": (_bytes("v.npz", b"hello " * 100), "v.npz"),
     "no numpy file": (_bytes("v.npy", b"hello" * 99), "not a file of numpy"),
     "NRRD cut in its header": (_bytes("v.nrrd", b"NRRD0004\ntype: short\n"), "it has no field sizes"),
-    "half a voxel": (_meta(DimSize="5 6 6.5"), "DimSize = 5 6 6.5: expected whole numbers"),
+    "half a voxel": (_meta(DimSize="5 6 6.5"), "DimSize = 6.5: expected a whole number from 1"),
     "no DICOM": (_bytes("v.dcm", b"hello" * 99), "v.dcm is no DICOM file"),
     "unknown suffix": (_bytes("v.xyz", b"hello" * 99), "expected a folder of DICOM files, or a name ending in"),
     "4-D NIfTI": (_nifti(np.zeros((3, 3, 3, 2), np.float32)), "expected a 3-D image, got shape 3 x 3 x 3 x 2"),

@@ -62,7 +62,7 @@ def test_pixel_sizes_have_the_unit_that_they_say(frames, tmp_path, unit, size, m
     "line, words",
     [
         ("matrix size [1] := 6.5", "matrix size [1] = 6.5: expected a whole number"),
-        ("number of energy windows := 1e9", "expected one that divides the 24 images"),
+        ("number of energy windows := 1e9", "number of energy windows = 1e9: expected a whole number"),
         ("number of energy windows := -1", "number of energy windows = -1"),
         ("number of energy windows := 7", "expected one that divides the 24 images"),
         ("data offset in bytes := -8", "data offset in bytes = -8"),

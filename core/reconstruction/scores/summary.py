@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ...arrays import ArrayLike, Floats
-from ...errors import InputError
+from ...errors import InputError, warn
 from ...geometry.frames import checked_affine
 from ...geometry.grid import same_grid
 from ...phantoms.derenzo import DerenzoRods
@@ -16,7 +16,7 @@ from ...phantoms.nema import NemaBody
 from ...phantoms.phantom import QUANTITIES, Phantom
 from ...progress import Progress
 from ...validation import instance
-from ...volumes.resampling import resample
+from ...volumes.resampling import outside_warnings, resample
 from ...volumes.volume import Volume, require_quantity
 from .derenzo import DerenzoScore, derenzo_score
 from .images import WINDOW, nrmse, psnr, ssim
@@ -153,6 +153,8 @@ def score_volume(
         raise InputError(f"score_volume: volume of {volume.quantity}, truth of {truth.quantity}")
     if same_grid(volume.grid, truth.grid):
         return _all_scores(volume, truth)
+    for text in outside_warnings(truth, volume.grid, "the volume", "where it is not scored"):
+        warn(text)
     note = "the truth, on another grid, is resampled onto the volume's voxels, as means"
     return _all_scores(volume, resample(truth, volume.grid, "mean", progress=progress), notes=(note,))
 

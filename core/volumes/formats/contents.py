@@ -51,8 +51,11 @@ class VolumeFileContents:
         return Volume(freeze(array), Grid(self.array.shape, self.affine), quantity)  # type: ignore[arg-type]
 
 
-def require_voxels(shape: Sequence[int], dtype: np.dtype[Any]) -> None:
-    """Raise `InputError` unless an image of `shape` and `dtype` is 3-D, of real numbers, and fits into memory."""
+def require_voxels(shape: Sequence[int], dtype: np.dtype[Any], n_held: float = math.inf) -> None:
+    """Raise `InputError` unless an image of `shape` and `dtype` is 3-D, of real numbers, and fits into memory.
+
+    It must not have more bytes than `n_held`, the most that the file can hold.
+    """
     sizes = " x ".join(map(str, shape)) or "of one value"
     if len(shape) != 3:
         raise InputError(f"expected a 3-D image, got shape {sizes}")
@@ -60,8 +63,11 @@ def require_voxels(shape: Sequence[int], dtype: np.dtype[Any]) -> None:
         raise InputError(f"expected at least one voxel along each axis, got {sizes}")
     if dtype.kind not in "fiub":
         raise InputError(f"expected real numbers, found {dtype}")
+    n_voxels = math.prod(int(n) for n in shape)
+    if dtype.itemsize * n_voxels > n_held:
+        raise InputError(f"expected {sizes} voxels of {dtype.itemsize} bytes, the file can hold {n_held:.0f} bytes")
     # Bytes of the file's values, of their float32 copy, and of the check that they are finite.
-    require((4.5 + dtype.itemsize) * math.prod(int(n) for n in shape), f"a volume of {sizes} voxels")
+    require((4.5 + dtype.itemsize) * n_voxels, f"a volume of {sizes} voxels")
 
 
 def require_one_data_file(field: str, name: str) -> None:

@@ -24,6 +24,7 @@ from ...errors import InputError, first_line, naming, reading, warn
 from ...files import require_file
 from ...geometry.frames import affine_matrix
 from ...progress import Progress, tell
+from ...validation import whole_in_file
 from .contents import RAS_FROM_LPS, VolumeFileContents, require_voxels
 from .dicom_units import DicomUnit, RealWorldValues, agree, real_world_values, unit_of
 
@@ -76,6 +77,15 @@ def image_kind(header: Any) -> str:
     """Return value 3 of a nuclear medicine image's ImageType, such as "TOMO", or "" if it has none."""
     values: Any = header.get("ImageType") or ()
     return str(values[2]) if not isinstance(values, str) and len(values) > 2 else ""
+
+
+def stated_count(tags: Any, name: str, default: int = 1) -> int:
+    """Return the whole number of a tag, such as NumberOfFrames, at least 1; `default` where it is missing, empty or 0.
+
+    It cannot be more than the bytes of the file of which the `tags` are; those of a sequence's item have none.
+    """
+    value, file = tags.get(name), getattr(tags, "filename", None)
+    return whole_in_file(value, name, 1, Path(file).stat().st_size if file else None) if value else default
 
 
 def require_grey(header: Any) -> None:
@@ -186,7 +196,7 @@ def _is_nuclear_medicine(header: Any) -> bool:
 
 def _is_whole_volume(header: Any) -> bool:
     """Return whether a single file is a whole volume: a nuclear medicine image of several frames."""
-    return _is_nuclear_medicine(header) and int(header.get("NumberOfFrames") or 1) > 1
+    return _is_nuclear_medicine(header) and stated_count(header, "NumberOfFrames") > 1
 
 
 def _sop_class(header: Any) -> str:
@@ -222,7 +232,7 @@ def _read_slices(path: Path, header: Any) -> Iterator[_Slice]:
     require_grey(header)
     if "ModalityLUTSequence" in header:
         raise InputError("values by a table (ModalityLUTSequence) are not read; expected RescaleSlope")
-    n_frames = int(header.get("NumberOfFrames") or 1)
+    n_frames = stated_count(header, "NumberOfFrames")
     frames = _frame_tags(header)
     if len(frames) != n_frames:
         raise InputError(f"{n_frames} frames without a place for each; expected an enhanced image, or one frame")
@@ -389,7 +399,7 @@ def _tomogram_tags(header: Any) -> list[dict[str, Any]]:
     Slice s lies (s - s_1) SpacingBetweenSlices from the first frame's slice s_1, along the cross product of the
     directions along the rows and down the columns.
     """
-    n_frames = int(header.get("NumberOfFrames") or 1)
+    n_frames = stated_count(header, "NumberOfFrames")
     has_slices = "SliceVector" in header
     kind = image_kind(header) or (TOMOGRAMS[0] if has_slices else "")
     if kind not in TOMOGRAMS:
@@ -397,7 +407,7 @@ def _tomogram_tags(header: Any) -> list[dict[str, Any]]:
         images = _OTHER_IMAGES.get(kind, "something else")
         raise InputError(f"it holds {images} ({stated}); expected a reconstructed tomogram (RECON TOMO)")
     slices = _numbers(header, "SliceVector", n_frames) if has_slices else np.arange(1.0, n_frames + 1)
-    n_slices = len(np.unique(slices)) if has_slices else int(header.get("NumberOfSlices") or 0)
+    n_slices = len(np.unique(slices)) if has_slices else stated_count(header, "NumberOfSlices", 0)
     _require_one_volume(header, n_frames, n_slices)
     shared = {name: header.get(name) for name in ("PixelSpacing", "SliceThickness", *_RESCALE)}
     # In the standard, position and orientation are properties of the detector, even in a tomogram.
@@ -418,7 +428,7 @@ def _require_one_volume(header: Any, n_frames: int, n_slices: int) -> None:
         ("EnergyWindow", "of {} energy windows"),
     ):
         # NumberOf... alone does not tell what the frames are: one tomogram may combine several windows.
-        number = int(header.get(f"NumberOf{name}s") or 1) if n_slices != n_frames else 1
+        number = stated_count(header, f"NumberOf{name}s") if n_slices != n_frames else 1
         if f"{name}Vector" in header:
             number = len(np.unique(header.get(f"{name}Vector")))
         if number > 1:

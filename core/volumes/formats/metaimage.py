@@ -4,6 +4,7 @@ Only ITK and SimpleITK read it in Python, and they are too large to depend on (5
 https://itk.org/Wiki/ITK/MetaIO/Documentation
 """
 
+import os
 import zlib
 from pathlib import Path
 from typing import BinaryIO
@@ -14,6 +15,7 @@ from ...arrays import Floats
 from ...errors import InputError, expecting
 from ...files import require_file
 from ...geometry.frames import affine_matrix
+from ...validation import whole_in_file
 from .contents import RAS_FROM_LPS, VolumeFileContents, require_one_data_file, require_voxels, warn_of_assumptions
 
 _TYPES = {
@@ -25,19 +27,20 @@ _MILLIMETRES = {"mm": 1.0, "cm": 10.0, "um": 0.001, "?": 1.0}
 _SPACINGS, _OFFSETS = ("ElementSpacing", "ElementSize"), ("Offset", "Position", "Origin")
 _MATRICES = ("TransformMatrix", "Rotation", "Orientation")
 _LONGEST_HEADER = 1 << 16
+_MOST_VOXELS = 2**31 - 1  # along an axis: ITK keeps them in 32 bits
 
 
 def read(path: Path) -> VolumeFileContents:
     """Read a .mha file, or a .mhd file and the file with its voxels."""
     with open(path, "rb") as file:
         header = _read_header(file)
-        sizes = _numbers(header, ("DimSize",), None)
-        if len(sizes) == 4 and sizes[3] == 1:  # one volume
-            sizes = sizes[:3]
-        if not (sizes == np.floor(sizes)).all():
-            raise InputError(f"DimSize = {header['DimSize']}: expected whole numbers")
-        shape = tuple(int(n) for n in sizes)
-        if int(header.get("ElementNumberOfChannels", 1)) != 1:
+        if "DimSize" not in header:
+            raise InputError("it has no DimSize")
+        shape = tuple(whole_in_file(number, "DimSize", 1, _MOST_VOXELS) for number in header["DimSize"].split())
+        whole_in_file(header.get("NDims", len(shape)), "NDims", len(shape), len(shape))
+        if len(shape) == 4 and shape[3] == 1:  # one volume
+            shape = shape[:3]
+        if header.get("ElementNumberOfChannels", "1") != "1":
             raise InputError(f"expected one value per voxel, found {header['ElementNumberOfChannels']}")
         element_type = header.get("ElementType", "nothing")
         if element_type not in _TYPES:
@@ -84,7 +87,8 @@ def _read_data(header: dict[str, str], file: BinaryIO, path: Path, size: int) ->
 
 def _decompress(header: dict[str, str], file: BinaryIO, size: int, name: str) -> bytes:
     """Return the `size` bytes of voxels that follow in `file`, decompressed if need be; messages begin with `name`."""
-    skip = int(header.get("HeaderSize", 0))
+    n_held = os.fstat(file.fileno()).st_size
+    skip = whole_in_file(header.get("HeaderSize", 0), "HeaderSize", -1, n_held)
     if _is_true(header.get("CompressedData", "False")):
         # One byte more than expected is requested, so that surplus data are noticed.
         decompressor = zlib.decompressobj(zlib.MAX_WBITS | 32)
@@ -93,10 +97,10 @@ def _decompress(header: dict[str, str], file: BinaryIO, size: int, name: str) ->
             raise InputError(f"{name} ends before the checksum of its voxels")
     else:
         if skip == -1:  # the voxels are the last bytes of the file
-            file.seek(-size, 2)
+            file.seek(-min(size, n_held), 2)
         elif skip:
             file.seek(skip, 1)
-        data = file.read(size + 1)
+        data = file.read(min(size, n_held) + 1)
     if len(data) != size:
         actual = "more" if len(data) > size else len(data)
         raise InputError(f"expected {size} bytes of voxels (DimSize x ElementType), {name} holds {actual}")
@@ -120,21 +124,16 @@ def _affine(header: dict[str, str], path: Path) -> Floats:
     return RAS_FROM_LPS @ affine_matrix(axes * _MILLIMETRES[unit], origin * _MILLIMETRES[unit])
 
 
-def _numbers(header: dict[str, str], keys: tuple[str, ...], default: Floats | None) -> Floats:
-    """Return the numbers of the first of `keys` in the header, as many as `default` has, or `default` if all are missing.
-
-    Without a default, any number of numbers is allowed, and a missing key raises `InputError`.
-    """
+def _numbers(header: dict[str, str], keys: tuple[str, ...], default: Floats) -> Floats:
+    """Return the numbers of the first of `keys` in the header, as many as `default` has, or `default` if all are missing."""
     text = next((header[key] for key in keys if key in header), None)
     if text is None:
-        if default is None:
-            raise InputError(f"it has no {keys[0]}")
         return default
     with expecting(f"{keys[0]} = {text}: expected numbers"):
         numbers = np.array(text.split(), np.float64)
-    if default is not None and len(header["DimSize"].split()) == 4 and len(numbers) in (4, 16):
+    if len(header["DimSize"].split()) == 4 and len(numbers) in (4, 16):
         numbers = numbers.reshape(-1, 4)[:3, :3].ravel()  # those of the first three axes
-    if default is not None and len(numbers) != len(default):
+    if len(numbers) != len(default):
         raise InputError(f"{keys[0]} = {text}: expected {len(default)} numbers")
     return numbers
 

@@ -3,6 +3,7 @@
 import contextlib
 import gzip
 import json
+import math
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ from .contents import VolumeFileContents, require_voxels
 
 _MILLIMETRES = {"unknown": 1.0, "mm": 1.0, "meter": 1000.0, "micron": 0.001}
 _ANALYZE_MILLIMETRES = {"": 1.0, "mm": 1.0, "cm": 10.0, "m": 1000.0, "um": 0.001}
+_DEFLATE = 1032  # largest ratio by which gzip compresses
 _MAX_GAP = 0.1  # voxels by which sform and qform may lie apart, because quaternions of float32 are rounded
 
 
@@ -57,7 +59,8 @@ def _contents(image: Any, path: Path) -> VolumeFileContents:
     """Return values, affine, quantity and unit of nibabel's image; warn where the patient's position is unclear."""
     import nibabel
 
-    require_voxels(image.shape, image.get_data_dtype())
+    n_held = _DEFLATE * path.stat().st_size if path.suffix.lower() == ".gz" else math.inf  # nibabel maps other files
+    require_voxels(image.shape, image.get_data_dtype(), n_held)
     affine, header = np.array(image.affine, np.float64), image.header
     if not isinstance(image, nibabel.Nifti1Pair):
         warn(f"{path}: Analyze files do not say where the patient lies: taken as centred, x from right to left")

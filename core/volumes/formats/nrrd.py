@@ -1,5 +1,6 @@
 """Read and write NRRD, by pynrrd."""
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -8,6 +9,7 @@ import numpy as np
 from ...errors import InputError, first_line
 from ...files import require_file
 from ...geometry.frames import affine_matrix
+from ...validation import whole_in_file
 from ..volume import Volume
 from .contents import VolumeFileContents, require_one_data_file, require_voxels, warn_of_assumptions
 
@@ -40,6 +42,7 @@ _FIELDS = (
     "space", "space dimension", "space units", "space origin", "space directions", "spacings", "units", "kinds",
     "sample units", *_SYNONYMS.values(),
 )  # fmt: skip
+_LONGEST_HEADER = 1 << 16  # bytes
 _SAME = 1e-6  # relative difference of two lengths that is explained by rounded decimals
 
 
@@ -56,6 +59,10 @@ def read(path: Path) -> VolumeFileContents:
     for name in ("type", "sizes"):
         if name not in header:
             raise InputError(f"it has no field {name}: it is damaged or ends early")
+    with open(path, "rb") as file:  # pynrrd rounds sizes
+        sizes_line = re.search(r"(?m)^sizes:(.*)", file.read(_LONGEST_HEADER).decode("latin-1"))
+    for size in sizes_line[1].split() if sizes_line else ():
+        whole_in_file(size, "sizes", 1)
     single = _single_axis(header)
     value_type = header["type"]
     if value_type == "block":
@@ -67,8 +74,11 @@ def read(path: Path) -> VolumeFileContents:
         raise InputError("old min and old max: quantized values are not read; unquantize them (unu unquantize)")
     data_file = header.get("data file", "")
     require_one_data_file("data file:", data_file)
-    if data_file and (path.parent / data_file).exists():
-        require_file(path.parent / data_file)
+    data_path = path.parent / data_file if data_file else path
+    if data_path.exists():
+        n_bytes = require_file(data_path).stat().st_size
+        for name in ("line skip", "byte skip"):
+            whole_in_file(header.get(name, 0), name, -(name == "byte skip"), n_bytes)
     affine = _affine(header, path)
     try:
         array, _ = nrrd.read(str(path))

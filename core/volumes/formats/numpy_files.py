@@ -44,17 +44,16 @@ def load(path: Path, names: set[str] | None = None) -> dict[str, Array]:
     Each member of an .npz is read to its end, where its checksum is.
     """
     with open(path, "rb") as file:  # not opened by numpy, which leaves a damaged archive open
-        if not file.read(6).startswith((b"\x93NUMPY", b"PK")):  # numpy would take other bytes for pickled objects
+        begin = file.read(6)
+        if not begin.startswith((b"\x93NUMPY", b"PK")):  # numpy would take other bytes for pickled objects
             raise InputError("not a file of numpy")
-        file.seek(0)
-        archive = np.load(file, allow_pickle=False)
-        is_single = isinstance(archive, np.ndarray)
-        if is_single != (path.suffix.lower() == ".npy"):
+        if (is_single := begin == b"\x93NUMPY") != (path.suffix.lower() == ".npy"):
             kinds = ("a single array", "an npz archive")
             raise InputError("expected {}, found {}".format(*(kinds[::-1] if is_single else kinds)))
-        if is_single:
-            return {"": archive}
-        arrays = {}
+        if is_single:  # mapped, so that its size is compared with the file's before memory is taken
+            return {"": np.array(np.load(path, mmap_mode="r", allow_pickle=False))}
+        file.seek(0)
+        archive, arrays = np.load(file, allow_pickle=False), {}
         for name in archive.files if names is None else names.intersection(archive.files):
             with archive.zip.open(f"{name}.npy") as member:
                 arrays[name] = np.lib.format.read_array(member, allow_pickle=False)  # type: ignore[no-untyped-call]

@@ -17,6 +17,7 @@ from types import MappingProxyType
 from typing import Any, NoReturn
 
 from ..errors import InputError, InputWarning
+from ..files import keeping_inputs
 from ..progress import Cancelled
 from ..version import VERSION
 from .options import COMMANDS, NotingStore, say
@@ -100,7 +101,8 @@ def _run_command(argv: Sequence[str] | None, more_commands: Mapping[str, str]) -
         warnings.simplefilter("always", InputWarning)
         warnings.showwarning = _show_warning
         try:
-            arguments.run(arguments)
+            with keeping_inputs():
+                arguments.run(arguments)
         except InputError as error:
             return _fail(str(error), INPUT_ERROR)
         except MemoryError:

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..errors import InputError
-from ..files import ensure_folder, refuse_folder, require_ending, write_bytes
+from ..files import ensure_folder, note_output, refuse_folder, require_ending, write_bytes
 from ..progress import Progress
 
 if TYPE_CHECKING:  # the parser of all commands reads this file, and numpy takes a while
@@ -129,16 +129,19 @@ def expand_to_three(values: list) -> list:
     return values * 3 if len(values) == 1 else values
 
 
-def output_path(text: str, suffixes: tuple[str, ...] = ()) -> Path:
+def output_path(text: str, suffixes: tuple[str, ...] = (), is_new: bool = True) -> Path:
     """Return the path of a file to write, whose name must end in one of `suffixes` if any are given.
 
-    A missing folder is made. This is called before the long work, so that a file that cannot be written is refused at once.
+    A missing folder is made. A file that `is_new` must be no input and no other output of the command. This is called before
+    the long work, so that a file that cannot be written is refused at once.
     """
     path = Path(text)
     if suffixes:
         require_ending(path, suffixes)
     refuse_folder(path)
     ensure_folder(path.parent)
+    if is_new:
+        note_output(path)
     return path
 
 

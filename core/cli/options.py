@@ -35,6 +35,7 @@ COMMANDS = {
 }
 """Module of a command -> its summary in the help; the module is imported only when its options are needed."""
 
+_LONG = re.compile(r"""(?<!\w)'[^']{199,}'|(?<!\w)"[^"]{199,}"|\[[^]]{199,}\]|\S{201,}""")
 _HANGING = 15 * " "  # indent of further lines in the second column of lists in descriptions
 
 
@@ -66,8 +67,11 @@ class NotingStore(argparse.Action):
         """Store the value; argparse calls this for each typed option."""
         if "" in (values if isinstance(values, list) else [values]):
             parser.error(f"argument {'/'.join(self.option_strings) or self.metavar or self.dest}: got an empty text")
+        typed = vars(namespace).setdefault("typed", {})
+        if self.dest == "output" and "output" in typed:  # of other options the last one holds
+            parser.error(f"argument {'/'.join(self.option_strings)}: it is given twice; expected it once")
         setattr(namespace, self.dest, values)
-        vars(namespace).setdefault("typed", {})[self.dest] = option_string
+        typed[self.dest] = option_string
 
 
 def refuse(arguments: argparse.Namespace, names: Iterable[str], reason: str) -> None:
@@ -188,7 +192,22 @@ def count_text(number: int, noun: str) -> str:
 def say(text: str) -> None:
     """Print a line on standard error; on a terminal it replaces an unfinished progress bar."""
     over = "\r\x1b[K" if sys.stderr.isatty() else ""
-    print(f"{over}mphdrr: {text}", file=sys.stderr, flush=True)
+    print(f"{over}mphdrr: {message_line(text)}", file=sys.stderr, flush=True)
+
+
+def message_line(text: str) -> str:
+    """Return a message as one line, with control characters escaped, and with at most 200 characters of a file's content.
+
+    A quoted text, a list, a path or a word of more than 200 characters is shortened, as is a message of more than 1000.
+    """
+    text = "".join(x if x.isprintable() else x.encode("unicode_escape").decode() for x in text)
+    text = _LONG.sub(lambda match: _shortened(match[0]), text)
+    return text if len(text) <= 1000 else _shortened(text)
+
+
+def _shortened(text: str) -> str:
+    """Return the first and the last characters of a text, 199 in all, with a mark between them."""
+    return f"{text[:150]}…{text[-49:]}"
 
 
 def progress_bar(label: str, status_text: Callable[[], str] | None = None) -> Progress:

@@ -119,6 +119,10 @@ def read_recipe(path: AnyPath) -> Recipe:
     folder = Path(path).parent
     tables = read_toml(path)
     with naming(path):
+        if not tables:
+            raise InputError(
+                f"it is empty; expected a recipe with some of the tables {', '.join(f'[{t}]' for t in TABLES)}"
+            )
         return _with_paths(recipe_from_tables(tables), lambda name: os.path.normpath(folder / name))
 
 

@@ -27,6 +27,7 @@ _LEFT_AFTER = 3600  # seconds: another host's temporary file that is untouched f
 _ATTEMPTS = 3
 _inputs: set[_Stamp] | None = None  # that the running command has read; None if no command runs
 _outputs: dict[str, _Stamp | None] = {}  # that it will write, by their real paths, as they were before
+_SAME = "is both an input and an output; choose another name for the output"
 _HOST = zlib.crc32(platform.node().encode()) & 0xFFFF
 
 
@@ -46,7 +47,7 @@ def note_input(path: _P) -> _P:
     """Return `path`, a file that the running command reads; raise `InputError` if the command is to replace it."""
     if _inputs is not None and (stamp := _stamp(path)):
         if stamp in _outputs.values():
-            raise InputError(f"{path}: is both an input and an output; choose another name for the output")
+            raise InputError(f"{path}: {_SAME}")
         _inputs.add(stamp)
     return path
 
@@ -59,7 +60,7 @@ def note_output(path: AnyPath) -> None:
     if _inputs is not None:
         name, stamp = os.path.realpath(path), _stamp(path)
         if stamp in _inputs:
-            raise InputError(f"{path}: is both an input and an output; choose another name for the output")
+            raise InputError(f"{path}: {_SAME}")
         if name in _outputs:
             raise InputError(f"{path}: is the name of two outputs; choose another for one of them")
         _outputs[name] = stamp

@@ -35,7 +35,7 @@ COMMANDS = {
 }
 """Module of a command -> its summary in the help; the module is imported only when its options are needed."""
 
-_LONG = re.compile(r"""(?<!\w)'[^']{199,}'|(?<!\w)"[^"]{199,}"|\[[^]]{199,}\]|\S{201,}""")
+_LONG = r"""(?<!\w)'[^']{199,}'|(?<!\w)"[^"]{199,}"|\[[^]]{199,}\]|\S{201,}"""
 _HANGING = 15 * " "  # indent of further lines in the second column of lists in descriptions
 
 
@@ -201,13 +201,9 @@ def message_line(text: str) -> str:
     A quoted text, a list, a path or a word of more than 200 characters is shortened, as is a message of more than 1000.
     """
     text = "".join(x if x.isprintable() else x.encode("unicode_escape").decode() for x in text)
-    text = _LONG.sub(lambda match: _shortened(match[0]), text)
-    return text if len(text) <= 1000 else _shortened(text)
-
-
-def _shortened(text: str) -> str:
-    """Return the first and the last characters of a text, 199 in all, with a mark between them."""
-    return f"{text[:150]}…{text[-49:]}"
+    for long in (_LONG, ".{1001,}"):
+        text = re.sub(long, lambda match: f"{match[0][:150]}…{match[0][-49:]}", text)
+    return text
 
 
 def progress_bar(label: str, status_text: Callable[[], str] | None = None) -> Progress:

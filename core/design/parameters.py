@@ -99,12 +99,7 @@ GENERATORS: Mapping[str, Callable[..., PinholeSystem]] = {
     "workbook": moved_modules,
 }
 """Functions that make a scanner from numbers, by their names in recipes."""
-_SIGNATURES = {
-    "ellipse": (ellipse_rings,),
-    "polygon": (polygon_rings, plate_rings),
-    "workbook": (displacement_parameters, moved_modules),
-}
-_OF_NO_RECIPE = {"sizes", "vertices", "system", "group", "overrides"}  # arguments that follow from others
+_DERIVED = {"sizes", "vertices", "system", "group", "overrides"}  # arguments that follow from others
 # Arguments that are angles: degrees in recipes, rad in the generators.
 _DEGREES = ("start", "end", "rotation", "tilt")
 
@@ -113,10 +108,11 @@ def check_generator(generator: Mapping[str, Any], free: Mapping[str, Any]) -> No
     """Raise `InputError` for entries of a recipe's tables ``[generator]`` and ``[free]`` that its kind does not have."""
     kind = generator.get("kind", "ellipse")
     one_of(kind, GENERATORS, "generator.kind")
-    names = [
-        name for function in _SIGNATURES[kind] for name in signature(function).parameters if name not in _OF_NO_RECIPE
-    ]
-    expected = dict.fromkeys(["kind", *(("file", "modules") if kind == "workbook" else ()), *names])
+    others: Mapping[str, Callable[..., Any]] = {"polygon": plate_rings, "workbook": displacement_parameters}
+    inner = others.get(kind, ellipse_rings)
+    names = ["kind", *signature(GENERATORS[kind]).parameters, *signature(inner).parameters]
+    names += ["file", "modules"] if kind == "workbook" else []
+    expected = [name for name in dict.fromkeys(names) if name not in _DERIVED]
     for table, entries in (("generator", generator), ("free", free)):
         for name in entries:
             if name not in expected:

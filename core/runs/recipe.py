@@ -120,9 +120,7 @@ def read_recipe(path: AnyPath) -> Recipe:
     tables = read_toml(path)
     with naming(path):
         if not tables:
-            raise InputError(
-                f"it is empty; expected a recipe with some of the tables {', '.join(f'[{t}]' for t in TABLES)}"
-            )
+            raise InputError(f"it is empty; expected some of the tables {', '.join(f'[{name}]' for name in TABLES)}")
         return _with_paths(recipe_from_tables(tables), lambda name: os.path.normpath(folder / name))
 
 

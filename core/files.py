@@ -12,16 +12,66 @@ import zlib
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import TypeVar
 
 from .errors import InputError, expecting, refusing
 
 AnyPath = str | os.PathLike[str]
+_P = TypeVar("_P", bound=AnyPath)
+_Stamp = tuple[int, int, int]
+"""Device, number and time of change of a file: the same under all of its names, another once the file is replaced."""
 
 _TEMPORARY = re.compile(r"\.(?:[0-9a-f]{8}|([0-9a-f]{4})([0-9a-f]{8})[0-9a-f]{8})-(.+)")
 """Name of a temporary file: the host and process that write it, by which leftovers of killed processes are recognised."""
 _LEFT_AFTER = 3600  # seconds: another host's temporary file that is untouched for so long is a leftover
 _ATTEMPTS = 3
+_inputs: set[_Stamp] | None = None  # that the running command has read; None if no command runs
+_outputs: dict[str, _Stamp | None] = {}  # that it will write, by their real paths, as they were before
+_SAME = "is both an input and an output; choose another name for the output"
 _HOST = zlib.crc32(platform.node().encode()) & 0xFFFF
+
+
+@contextmanager
+def keeping_inputs() -> Iterator[None]:
+    """Refuse, within the block of a command, to write what the command reads (`note_input`, `note_output`)."""
+    global _inputs
+    _inputs = set()
+    _outputs.clear()
+    try:
+        yield
+    finally:
+        _inputs = None
+
+
+def note_input(path: _P) -> _P:
+    """Return `path`, a file that the running command reads; raise `InputError` if the command is to replace it."""
+    if _inputs is not None and (stamp := _stamp(path)):
+        if stamp in _outputs.values():
+            raise InputError(f"{path}: {_SAME}")
+        _inputs.add(stamp)
+    return path
+
+
+def note_output(path: AnyPath) -> None:
+    """Note that the running command will write a file; raise `InputError` if it reads that, or writes it for another output.
+
+    This is called before the file is written. Later the command may read what it has written.
+    """
+    if _inputs is not None:
+        name, stamp = os.path.realpath(path), _stamp(path)
+        if stamp in _inputs:
+            raise InputError(f"{path}: {_SAME}")
+        if name in _outputs:
+            raise InputError(f"{path}: is the name of two outputs; choose another for one of them")
+        _outputs[name] = stamp
+
+
+def _stamp(path: AnyPath) -> _Stamp | None:
+    """Return the stamp of an existing file, else None; links are followed."""
+    with suppress(OSError, ValueError):
+        facts = os.stat(path)
+        return facts.st_dev, facts.st_ino, facts.st_mtime_ns
+    return None
 
 
 @contextmanager
@@ -151,10 +201,11 @@ def remove_leftovers(folder: Path) -> None:
         path.unlink(missing_ok=True)
 
 
-def require_file(path: AnyPath, expected: str = "a file") -> Path:
+def require_file(path: AnyPath, expected: str = "a file", is_input: bool = True) -> Path:
     """Return `path` if it is a file that can be read; refuse a missing file, a folder, a device and a pipe.
 
-    Raises `InputError`, which names what was `expected` in place of a folder or device.
+    A file that `is_input` is noted (`note_input`). Raises `InputError`, which names what was `expected` in place of a folder
+    or device.
     """
     path = Path(path)
     if "\0" in str(path):
@@ -168,7 +219,7 @@ def require_file(path: AnyPath, expected: str = "a file") -> Path:
             kind = "a folder" if stat.S_ISDIR(mode) else "neither a file nor a folder"
             raise InputError(f"{path}: is {kind}, expected {expected}")
         path.open("rb").close()  # libraries say little about a file that the user may not read
-    return path
+    return note_input(path) if is_input else path
 
 
 def find_ending(path: AnyPath, endings: Sequence[str]) -> str:

@@ -96,7 +96,7 @@ def figure_job(
     options = Rendering(**style)
     kind, scene = figure_kind(name), context.scene
     page = kind.page(size, options)
-    paths = [output_path(str(path), kind.suffixes) for path in paths]
+    paths = [output_path(str(path), kind.suffixes, is_new=False) for path in paths]
     collection = scanner.active_scanner(scene)
     item = _volume_item(context) if "volume" in kind.needs else None
     active = selection.active_module(context)

@@ -17,6 +17,7 @@ from types import MappingProxyType
 from typing import Any, NoReturn
 
 from ..errors import InputError, InputWarning
+from ..files import keeping_inputs
 from ..progress import Cancelled
 from ..version import VERSION
 from .options import COMMANDS, NotingStore, say
@@ -65,6 +66,10 @@ def build_parser(more_commands: Mapping[str, str] = MappingProxyType({}), only: 
 
 def main(argv: Sequence[str] | None = None, more_commands: Mapping[str, str] = MappingProxyType({})) -> int:
     """Run one command line and return its exit status: 0, 1 (error in the user's input), 2 (usage) or 130 (interrupted)."""
+    if sys.stderr is None:  # closed by the shell (2>&-); what is printed there would go to the output
+        sys.stderr = io.StringIO()
+    if sys.stdout is None:
+        return _fail("output: it is closed (>&-); expected an open one, such as > FILE", INPUT_ERROR)
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")  # a terminal of ASCII has no µ, ° or …
@@ -100,7 +105,8 @@ def _run_command(argv: Sequence[str] | None, more_commands: Mapping[str, str]) -
         warnings.simplefilter("always", InputWarning)
         warnings.showwarning = _show_warning
         try:
-            arguments.run(arguments)
+            with keeping_inputs():
+                arguments.run(arguments)
         except InputError as error:
             return _fail(str(error), INPUT_ERROR)
         except MemoryError:

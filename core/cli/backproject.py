@@ -35,8 +35,6 @@ def _run(arguments: argparse.Namespace) -> None:
 
     path = output_path(arguments.output, VOLUME_FORMATS)
     count_path = output_path(arguments.views_that_see, VOLUME_FORMATS) if arguments.views_that_see else None
-    if count_path is not None and count_path.resolve() == path.resolve():
-        raise mph.InputError(f"--views-that-see {count_path}: it is the same file as --output")
     run = mph.read_run(arguments.file)
     grid = backprojection_grid(run, run.recipe.updated(entries_from_options(arguments)))
     view_counts = mph.views_that_see(run.views, grid, progress_bar("counting views"))

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..errors import InputError
-from ..files import ensure_folder, refuse_folder, require_ending, write_bytes
+from ..files import ensure_folder, note_output, refuse_folder, require_ending, write_bytes
 from ..progress import Progress
 
 if TYPE_CHECKING:  # the parser of all commands reads this file, and numpy takes a while
@@ -35,6 +35,7 @@ COMMANDS = {
 }
 """Module of a command -> its summary in the help; the module is imported only when its options are needed."""
 
+_LONG = r"""(?<!\w)'[^']{199,}'|(?<!\w)"[^"]{199,}"|\[[^]]{199,}\]|\S{201,}"""
 _HANGING = 15 * " "  # indent of further lines in the second column of lists in descriptions
 
 
@@ -66,8 +67,11 @@ class NotingStore(argparse.Action):
         """Store the value; argparse calls this for each typed option."""
         if "" in (values if isinstance(values, list) else [values]):
             parser.error(f"argument {'/'.join(self.option_strings) or self.metavar or self.dest}: got an empty text")
+        typed = vars(namespace).setdefault("typed", {})
+        if self.dest == "output" and "output" in typed:  # of other options the last one holds
+            parser.error(f"argument {'/'.join(self.option_strings)}: it is given twice; expected it once")
         setattr(namespace, self.dest, values)
-        vars(namespace).setdefault("typed", {})[self.dest] = option_string
+        typed[self.dest] = option_string
 
 
 def refuse(arguments: argparse.Namespace, names: Iterable[str], reason: str) -> None:
@@ -129,16 +133,19 @@ def expand_to_three(values: list) -> list:
     return values * 3 if len(values) == 1 else values
 
 
-def output_path(text: str, suffixes: tuple[str, ...] = ()) -> Path:
+def output_path(text: str, suffixes: tuple[str, ...] = (), is_new: bool = True) -> Path:
     """Return the path of a file to write, whose name must end in one of `suffixes` if any are given.
 
-    A missing folder is made. This is called before the long work, so that a file that cannot be written is refused at once.
+    A missing folder is made. A file that `is_new` must be no input and no other output of the command. This is called before
+    the long work, so that a file that cannot be written is refused at once.
     """
     path = Path(text)
     if suffixes:
         require_ending(path, suffixes)
     refuse_folder(path)
     ensure_folder(path.parent)
+    if is_new:
+        note_output(path)
     return path
 
 
@@ -185,7 +192,18 @@ def count_text(number: int, noun: str) -> str:
 def say(text: str) -> None:
     """Print a line on standard error; on a terminal it replaces an unfinished progress bar."""
     over = "\r\x1b[K" if sys.stderr.isatty() else ""
-    print(f"{over}mphdrr: {text}", file=sys.stderr, flush=True)
+    print(f"{over}mphdrr: {message_line(text)}", file=sys.stderr, flush=True)
+
+
+def message_line(text: str) -> str:
+    """Return a message as one line, with control characters escaped, and with at most 200 characters of a file's content.
+
+    A quoted text, a list, a path or a word of more than 200 characters is shortened, as is a message of more than 1000.
+    """
+    text = "".join(x if x.isprintable() else x.encode("unicode_escape").decode() for x in text)
+    for long in (_LONG, ".{1001,}"):
+        text = re.sub(long, lambda match: f"{match[0][:150]}…{match[0][-49:]}", text)
+    return text
 
 
 def progress_bar(label: str, status_text: Callable[[], str] | None = None) -> Progress:

@@ -6,7 +6,6 @@ Every setting of `runs.settings` is an option; the help lists the most used ones
 from __future__ import annotations
 
 import argparse
-import itertools
 from pathlib import Path
 from typing import Any
 
@@ -135,6 +134,7 @@ def _run(arguments: argparse.Namespace) -> None:
     mphdrr project scanner.xlsx --counts counts.npy --frames 1-80 --orientation front+v --time 600 -o run.h5
         --mosaic check.png
     """
+    from ..runs.recipe import note_files
     from ..runs.run_recipe import recipe_frames
 
     if arguments.write_recipe:
@@ -149,12 +149,10 @@ def _run(arguments: argparse.Namespace) -> None:
     picture = output_path(arguments.mosaic) if arguments.mosaic else None
     recipe, data = _recipe_and_data(arguments)
     n_runs = len(recipe_frames(recipe))
-    outputs = {numbered_path(path, number, n_runs).resolve() for number in range(1, n_runs + 1)}
-    file_lists = (recipe[key] or () for key in ("volume.states", "counts.files", "attenuation.file"))
-    for file in (*itertools.chain(*file_lists), recipe["volume.file"]):
-        if file is not None and Path(file).resolve() in outputs:
-            problem = "the projections would replace what they are made from"
-            raise mph.InputError(f"{file}: {problem}; choose another --output")
+    for output in filter(None, (path, picture) if n_runs > 1 else ()):
+        for number in range(1, n_runs + 1):
+            output_path(str(numbered_path(output, number, n_runs)))
+    note_files(recipe)
     for number, run in enumerate(mph.run_recipe(recipe, **data, stages=progress_bar), 1):
         file = numbered_path(path, number, n_runs)
         mph.write_run(run, file)

@@ -68,6 +68,7 @@ def _run(arguments: argparse.Namespace) -> None:
     mphdrr reconstruct run.h5 --set model.intrinsic_fwhm=3 -o volume.nii.gz
     """
     from ..figures.reconstructions import SIZE, SIZE_BESIDE_TRUTH, draw
+    from ..runs.recipe import note_files
     from ..runs.reconstructing import voxels_text
 
     if arguments.write_recipe:
@@ -82,6 +83,7 @@ def _run(arguments: argparse.Namespace) -> None:
     state = output_path(arguments.save_state, (".h5", ".hdf5")) if arguments.save_state else None
     run = mph.read_run(arguments.file)
     recipe = _recipe_from_options(arguments, run)
+    note_files(recipe)
     start: mph.Volume | mph.Reconstruction | None = None
     if arguments.start is not None:
         start = mph.read_volume(arguments.start, "activity" if run.volume is None else run.volume.quantity)

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from inspect import signature
 from typing import Any
 
 import numpy as np
@@ -98,8 +99,24 @@ GENERATORS: Mapping[str, Callable[..., PinholeSystem]] = {
     "workbook": moved_modules,
 }
 """Functions that make a scanner from numbers, by their names in recipes."""
+_DERIVED = {"sizes", "vertices", "system", "group", "overrides"}  # arguments that follow from others
 # Arguments that are angles: degrees in recipes, rad in the generators.
 _DEGREES = ("start", "end", "rotation", "tilt")
+
+
+def check_generator(generator: Mapping[str, Any], free: Mapping[str, Any]) -> None:
+    """Raise `InputError` for entries of a recipe's tables ``[generator]`` and ``[free]`` that its kind does not have."""
+    kind = generator.get("kind", "ellipse")
+    one_of(kind, GENERATORS, "generator.kind")
+    others: Mapping[str, Callable[..., Any]] = {"polygon": plate_rings, "workbook": displacement_parameters}
+    inner = others.get(kind, ellipse_rings)
+    names = ["kind", *signature(GENERATORS[kind]).parameters, *signature(inner).parameters]
+    names += ["file", "modules"] if kind == "workbook" else []
+    expected = [name for name in dict.fromkeys(names) if name not in _DERIVED]
+    for table, entries in (("generator", generator), ("free", free)):
+        for name in entries:
+            if name not in expected:
+                raise InputError(f"{table}.{name}: no such entry; {kind} has {', '.join(expected)}")
 
 
 def free_parameters(kind: str, fixed: Mapping[str, Any], free: Mapping[str, Any]) -> FreeParameters:
@@ -131,7 +148,7 @@ def free_parameters(kind: str, fixed: Mapping[str, Any], free: Mapping[str, Any]
         with naming("generator"):
             try:
                 return GENERATORS[kind](**arguments)
-            except TypeError as error:  # an argument is missing, or unknown: Python names it
+            except TypeError as error:  # an argument is missing: Python names it
                 raise InputError(str(error).partition("() ")[2]) from None
 
     low, high = np.concatenate(limits).T

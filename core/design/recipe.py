@@ -26,7 +26,7 @@ from ..runs.settings import SETTINGS
 from ..validation import one_of
 from ..workbook import read_system
 from .objectives import Detail, Lesion, Regions, Sensitivity, ball_points
-from .parameters import FreeParameters, displacement_parameters, free_parameters
+from .parameters import FreeParameters, check_generator, displacement_parameters, free_parameters
 from .penalties import Clearance, Constraint, CrystalArea, FieldOfView, LineOfSight, ModuleSeparation, SmallestHole
 from .solvers import SOLVERS
 
@@ -122,6 +122,7 @@ class DesignRecipe(Values):
         are_tables = isinstance(self.objectives, list) and all(isinstance(entry, dict) for entry in self.objectives)
         if not are_tables or not self.objectives:
             raise InputError("objectives: expected one [[objectives]] or more")
+        check_generator(self.generator, self.free)
         _ = self.goals  # refuses settings that cannot be understood
 
     @cached_property

@@ -22,6 +22,20 @@ _event_lock = threading.Lock()
 """Lock that is held while an event is made, since one event uses all threads of its Dask worker."""
 
 
+def check_address(address: str) -> None:
+    """Raise `InputError` for what cannot be the address of a scheduler: Dask would try for long to reach it."""
+    with needing("mphdrr[dask]", "--dask"):
+        from distributed.comm import resolve_address
+    if address == "local":
+        return
+    try:
+        port = resolve_address(address).rpartition(":")[2]  # asks for the host's address
+        if port.lstrip("-").isdecimal() and not 0 < int(port) < 65536:
+            raise ValueError(f"port {port}")
+    except (OSError, ValueError) as error:
+        raise InputError(f"--dask {address}: expected local, or an address such as tcp://host:8786 ({error})") from None
+
+
 def make_in_cluster(target: SetFolder, numbers: Sequence[int], address: str, workers: int) -> Iterator[Written]:
     """Make events of a prepared set on a Dask cluster and yield them in order of completion.
 

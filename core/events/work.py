@@ -12,7 +12,7 @@ from ..files import AnyPath, Locked, ensure_folder, remove_leftovers
 from ..memory import readable_size
 from ..progress import Progress, tell
 from ..validation import seed_number, whole_number
-from .dask_work import make_in_cluster
+from .dask_work import check_address, make_in_cluster
 from .event_maker import EventMaker
 from .event_set import EventSet
 from .folders import SetFolder
@@ -142,6 +142,8 @@ def making(
         In the same cases as `make`.
     """
     seed_number(first, "first")
+    if dask is not None:
+        check_address(dask)
     target = SetFolder(folder)
     requested = target.requested if count is None else [range(first, first + whole_number(count, "count"))]
     if not requested:

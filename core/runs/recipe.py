@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import InputError, naming
-from ..files import AnyPath, require_ending, write_bytes
+from ..files import AnyPath, note_input, require_ending, write_bytes
 from ..phantoms.settings import setting_names
 from ..recipes.settings import Setting
 from ..recipes.toml import read_toml, toml_value
@@ -119,7 +119,14 @@ def read_recipe(path: AnyPath) -> Recipe:
     folder = Path(path).parent
     tables = read_toml(path)
     with naming(path):
+        if not tables:
+            raise InputError(f"it is empty; expected some of the tables {', '.join(f'[{name}]' for name in TABLES)}")
         return _with_paths(recipe_from_tables(tables), lambda name: os.path.normpath(folder / name))
+
+
+def note_files(recipe: Recipe) -> None:
+    """Note all files that a recipe names as inputs of the running command; `note_input` refuses those that are outputs."""
+    _with_paths(recipe, note_input)
 
 
 def write_recipe(recipe: Recipe, path: AnyPath) -> None:

@@ -106,8 +106,8 @@ def test_what_is_not_understood_is_refused_before_anything_is_written(scanner, f
         mph.write_run(made(scanner, **changes), tmp_path / f"{name}.npz")
     for words, message in (
         ([tmp_path / "none.h5"], "no such file"),
-        ([file, "-o", tmp_path / "b.txt"], ".nii.gz"),
-        ([file, "--views-that-see", output], "same file as --output"),
+        ([file, "--views-that-see", tmp_path / "b.txt"], ".nii.gz"),
+        ([file, "--views-that-see", output], "is the name of two outputs"),
         ([file, "--voxels", 0], "voxels"),
         ([file, *SMALL, "--center", 0, 0, 5000], "no view sees any"),
         ([tmp_path / "other.npz"], "inverse-square are no line integrals"),

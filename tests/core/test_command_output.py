@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import io
 import os
+import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -16,7 +17,7 @@ from mphdrr.addon.cli import COMMANDS, main
 from mphdrr.core.cli import build_parser
 
 from .conftest import FEWER_MODULES as WORKBOOK
-from .conftest import refused, run_python
+from .conftest import refused, refused_command, run_python
 
 
 def parsers(
@@ -155,3 +156,62 @@ def test_a_name_that_is_empty_is_never_the_current_folder(typed, event_set, caps
     ):
         refused(call, "the name of a folder", "empty")
     assert not list(Path().iterdir())
+
+
+@pytest.mark.skipif(os.name == "nt", reason="a shell of POSIX closes the streams")
+@pytest.mark.parametrize("words", ["--help", f"geometry show {WORKBOOK}", "phantom derenzo --voxels 4 -o a.npz"])
+def test_closed_streams_are_an_error_of_one_line_before_work_begins(tmp_path, words):
+    program = f"'{sys.executable}' -m mphdrr {words}"
+    said = subprocess.run(f"{program} >&-", shell=True, capture_output=True, text=True, cwd=tmp_path)
+    assert said.returncode == 1 and said.stderr.startswith("mphdrr: output: it is closed"), said.stderr
+    assert said.stderr.count("\n") == 1 and not list(tmp_path.iterdir())
+    said = subprocess.run(f"{program} -x 2>&-", shell=True, capture_output=True, text=True, cwd=tmp_path)
+    assert said.returncode in (0, 2) and "Traceback" not in said.stdout and "unrecognized" not in said.stdout
+
+
+def test_outputs_that_are_given_twice_are_refused(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    for command, option in (
+        ("phantom derenzo --voxels 4 -o a.npz -o b.npz", "-o/--output"),
+        ("phantom derenzo --voxels 4 -o a.npz --output a.npz", "-o/--output"),
+        ("design pareto front.toml -o a.csv -o a.png", "-o/--output"),
+        ("reconstruct run.h5 -o a.npz -o b.npz", "-o/--output"),
+    ):
+        assert main(command.split()) == 2, command
+        said = capsys.readouterr().err
+        assert f"argument {option}: it is given twice" in said and said.count("\n") == 1, said
+        assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        '"{}" = 3', '[model]\nkind = "{}"', "[model]\nkind = ['{}']", '"{}" = {{x = 1}}', '[system]\nfile = "{}"',
+        '[model]\ntime = "{}"',
+    ],
+)  # fmt: skip
+@pytest.mark.parametrize("text", ["Q" * 300, "Q" * 100_000, "Q Q" * 5000], ids=["long", "longer", "words"])
+def test_errors_show_little_of_a_file(tmp_path, capsys, content, text):
+    path = tmp_path / "a.toml"
+    path.write_text(content.format(text))
+    line = refused_command(capsys, "project", path, "-o", tmp_path / "run.h5")
+    assert 1 <= line.count("Q") <= 200
+
+
+def test_control_characters_of_files_are_escaped(tmp_path, capsys):
+    path = tmp_path / "a.toml"
+    path.write_text(r'"a\u001b[2J\r\nb\u202ec\u0007" = 3')
+    line = refused_command(capsys, "project", path, "-o", tmp_path / "run.h5")
+    assert r"a\x1b[2J\r\nb\u202ec\x07: expected one of the tables" in line and line.isprintable()
+
+
+def test_empty_and_foreign_files_are_no_recipes(tmp_path, capsys, typed):
+    (tmp_path / "empty.toml").touch()
+    (tmp_path / "comment.toml").write_text("# nothing\n")
+    (tmp_path / "foreign.toml").write_text("[tool.ruff]\nline-length = 128\n")
+    (tmp_path / "bytes.toml").write_bytes(bytes(range(256)))
+    for name in ("empty", "comment", "foreign", "bytes"):
+        path = tmp_path / f"{name}.toml"
+        words = typed(f"reconstruct RUN --method sirt --iterations 1 --recipe {path} -o a.npz", "")
+        line = refused_command(capsys, *words)
+        assert line.startswith(f"{path}: ") and "expected" in line and not Path("a.npz").exists()

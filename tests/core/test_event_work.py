@@ -248,3 +248,22 @@ def test_the_command_says_what_it_does(tmp_path, command):
     assert "2 of 2 events, 1 made now" in command(*make).out
     assert "shard: expected i/n with i from 1 to n, got 4/3" in command(*make, "--shard", "4/3", status=1).err
     command(*make, "--shard", "x", status=2)
+
+
+def test_what_is_no_address_of_a_cluster_is_refused_at_once(tmp_path, capsys):
+    pytest.importorskip("distributed")
+    small_recipe(tmp_path)
+    words = ["events", "make", tmp_path / "set", "--recipe", tmp_path / "small.toml", "-n", 2, "--dask"]
+    start = time.monotonic()
+    for address in (
+        "nonsense",
+        "host:port",
+        "http://127.0.0.1:1",
+        "tcp://127.0.0.1:99999",
+        "127.0.0.1:-5",
+        "..:8786",
+        "a b:3",
+    ):
+        line = refused_command(capsys, *words, address)
+        assert line.startswith(f"--dask {address}: expected local, or an address such as tcp://"), line
+    assert time.monotonic() - start < 20 and not (tmp_path / "set").exists()

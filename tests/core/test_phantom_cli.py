@@ -156,11 +156,11 @@ def test_a_beating_heart_is_a_run_for_each_state(small_workbook, tmp_path, capsy
         assert (tmp_path / f"m-{k + 1}.png").is_file()
     capsys.readouterr()
     assert main([*project, "--states", *files, "-o", str(tmp_path / "beat.npz")]) == 1
-    assert "the projections would replace what they are made from" in capsys.readouterr().err
+    assert "is both an input and an output" in capsys.readouterr().err
     mu = str(tmp_path / "mu.npz")
     mph.write_volume(mph.Volume(0.01 * states[0].array, states[0].grid, "mu"), mu)
     assert main([*project, "--volume", files[0], "--mu", mu, "-o", mu]) == 1
-    assert "the projections would replace what they are made from" in capsys.readouterr().err
+    assert "is both an input and an output" in capsys.readouterr().err
     assert np.array_equal(mph.read_volume(files[0]).array, states[0].array)
 
 

@@ -35,12 +35,13 @@ def _run(arguments: argparse.Namespace) -> None:
     from ...design.calibration_recipe import run_calibration  # this import takes a while, which --help does not need
 
     path = output_path(arguments.output, (".xlsx", ".xlsm"))
+    record_path, picture_path = (output_path(str(path.with_suffix(suffix))) for suffix in (".json", ".png"))
     calibration = run_calibration(arguments.recipe, progress_bar("finding spots"))
     source = calibration.system.source
     mph.write_system(calibration.system, path, None if source is None else source.path)
     record = _record(calibration)
-    write_bytes(path.with_suffix(".json"), json.dumps(record, indent=1).encode())
-    write_png(calibration.residual_sheet().picture, path.with_suffix(".png"))
+    write_bytes(record_path, json.dumps(record, indent=1).encode())
+    write_png(calibration.residual_sheet().picture, picture_path)
     print_answer(arguments, record, _lines(calibration, path))
 
 

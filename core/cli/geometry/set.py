@@ -74,7 +74,7 @@ def _run(arguments: argparse.Namespace) -> None:
 
     mphdrr geometry set scanner.xlsx --modules 1-20 --diameter 2 -o thinner.xlsx
     """
-    target = output_path(arguments.output, (".xlsx", ".xlsm"))
+    target = output_path(arguments.output, (".xlsx", ".xlsm"), is_new=False)
     if arguments.write_columns is not None and arguments.columns is None:
         raise mph.InputError("--write-columns: the workbook is read by its headings, expected it with --columns")
     map_path = None if arguments.write_columns is None else output_path(arguments.write_columns, (".toml",))

@@ -8,7 +8,9 @@ the table in `events/programs.py`, from which `mphdrr events export` takes it. A
 `core/cli/events/export.py`.
 """
 
+import os
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 from ...errors import InputError
@@ -55,6 +57,10 @@ def plan_export(
         require_counted(events, names)
     selection = ExportSelection(events, tuple(dict.fromkeys(names)), noise, level)
     layout = chosen_program.layout(selection, **options)
+    real_folder = Path(os.path.realpath(folder_path(folder)))
+    for set_folder in {event.path.parents[1] for event in events}:
+        if any(place.exists() and place.samefile(set_folder) for place in (real_folder, *real_folder.parents)):
+            raise InputError(f"{folder}: is in the folder of the set that is exported; choose one outside it")
     return make_plan(layout, folder_path(folder), program, {**options, **layout.option_contents()})
 
 

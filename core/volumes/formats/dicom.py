@@ -21,7 +21,7 @@ import numpy as np
 
 from ...arrays import Array, Floats
 from ...errors import InputError, first_line, naming, reading, warn
-from ...files import require_file
+from ...files import note_input, require_file
 from ...geometry.frames import affine_matrix
 from ...progress import Progress, tell
 from ...validation import whole_in_file
@@ -106,6 +106,8 @@ def read(path: Path, series: str | None = None, progress: Progress | None = None
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", module="pydicom")  # warnings of tags that are not used here
         headers = _choose_series(_read_headers(path), series)
+        for file, _ in headers:
+            note_input(file)
         if len(headers) > 1 and any(_is_whole_volume(header) for _, header in headers):
             names = ", ".join(file.name for file, _ in headers)
             raise InputError(f"its series has several files of several frames each, choose one: {names}")
@@ -145,7 +147,7 @@ def _read_headers(path: Path) -> list[tuple[Path, Any]]:
         if file in headers or file.is_dir() or file.name.startswith("._"):  # ._NAME: a folder's data of macOS
             continue
         with naming(file.name):
-            is_bare = _is_bare(require_file(file))
+            is_bare = _is_bare(require_file(file, is_input=False))
         if not (is_bare or is_dicom(file)):
             if file.suffix.lower() in (".dcm", ".ima"):
                 raise InputError(f"{file.name} is no DICOM file")

@@ -275,4 +275,4 @@ def _halve_voxels(volume: Volume) -> Volume:
 
 def _laplacian(array: Floats32) -> Floats32:
     """Return the sum of the second differences along the axes."""
-    return sum(np.gradient(np.gradient(array, axis=axis), axis=axis) for axis in range(3))
+    return np.asarray(sum(np.gradient(np.gradient(array, axis=axis), axis=axis) for axis in range(3)), np.float32)

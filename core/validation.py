@@ -145,19 +145,19 @@ def strict_whole(value: Any, name: str, expected: str) -> int:
     return int(value)
 
 
-def whole_in_file(value: Any, name: str, least: int = 0, most: int | None = None) -> int:
-    """Return a number of a file's header, or its text, as a whole number from `least` to `most`.
+def whole_in_file(value: Any, name: str, least: int = 0, largest: int | None = None) -> int:
+    """Return a number of a file's header, or its text, as a whole number from `least` to `largest`.
 
-    Raises `InputError` for others. Readers call it before a number drives a loop or takes memory; `most` is what the bytes
-    of the file allow.
+    Raises `InputError` for others. Readers call it before a number drives a loop or takes memory; `largest` is what the
+    bytes of the file allow.
     """
     try:
         number = float(value)
-        is_valid = number == int(number) and least <= number and (most is None or number <= most)
+        is_valid = number == int(number) and least <= number and (largest is None or number <= largest)
     except (TypeError, ValueError, OverflowError):
         is_valid = False
     if not is_valid:
-        limit = "" if most is None else f" to {most}"
+        limit = "" if largest is None else f" to {largest}"
         raise InputError(f"{name} = {value!s:.40}: expected a whole number from {least}{limit}")
     return int(number)
 

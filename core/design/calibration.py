@@ -229,8 +229,9 @@ def calibrate(
     pairs, lengths = _known_distances(distances, n_k)
     if points is not None and len(pairs):
         raise InputError("calibrate: give points or distances, not both")
-    known, stages = None if points is None else real_array(points, "calibrate: points", (n_k, 3)), stages_of(progress)
-    spots, start = _find_spots(images, model, SpotModel.from_model(model, views, source_diameter), known, stages)
+    known_points = None if points is None else real_array(points, "calibrate: points", (n_k, 3))
+    stages = stages_of(progress)
+    spots, start = _find_spots(images, model, SpotModel.from_model(model, views, source_diameter), known_points, stages)
     stages("finding modules")
     covariance, positions = spots.covariance[..., :2, :2].copy(), spots.centers.copy()
     pearson, freedom = spots.pearson()
@@ -343,9 +344,9 @@ def _with_known_sources(free: BundleAdjustment, are_points: bool, pairs: Indexes
         lengths = np.linalg.norm(np.diff(points[pairs], axis=1)[:, 0], axis=1)
         groups, name = (pairs == np.arange(n_k)[:, None, None]).any(axis=2), "points"
         labels = [str(k + 1) for k in range(n_k)]
-    some = slice(None, None, max(1, len(free.system) // _MODULES_OF_CHECK))
-    trial = replace(free, system=free.system[some], positions=free.positions[:, some], whitening=free.whitening[:, some],
-                    used=free.used[:, some])  # fmt: skip
+    checked = slice(None, None, max(1, len(free.system) // _MODULES_OF_CHECK))
+    trial = replace(free, system=free.system[checked], positions=free.positions[:, checked],
+                    whitening=free.whitening[:, checked], used=free.used[:, checked])  # fmt: skip
     if trial.used.sum(axis=1).min() < 2:
         return bundle
     trial, x = _fit_without_outliers(trial)

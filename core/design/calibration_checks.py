@@ -52,7 +52,8 @@ def warn_of_fit(spots: Spots, used: Bools, geometry: FittedGeometry, chi_square:
     slope = float((used * spots.score * squares).sum()) / max(information, 1e-30)
     if abs(slope) * information**0.5 > _SIGNIFICANT:
         variances = spots.model.source_variance, max(0.0, spots.model.source_variance + slope)
-        told, fitted = (math.sqrt(20 * variance) for variance in variances)
-        causes = f"sources are like balls of {fitted:.2g} mm instead of {told:g} mm (source_diameter)"
+        stated_diameter, fitted_diameter = (math.sqrt(20 * variance) for variance in variances)
+        balls = f"balls of {fitted_diameter:.2g} mm instead of {stated_diameter:g} mm"
+        causes = f"sources are like {balls} (source_diameter)"
         change = "wider" if slope > 0 else "sharper"
         warn(f"calibrate: the more the spots are magnified, the {change} they are: {causes}", 4)

@@ -100,7 +100,7 @@ def _view_difference(run: ProjectionRun, first: ProjectionRun) -> str:
             f"the {settings.get('detector')} detector", f"{shape_text(views.shape)} pixels",
             f"magnification {magnification:g}", f"pixels of {' x '.join(sizes)} mm",
         ))  # fmt: skip
-    texts = [f"{own}, but {other}" for own, other in zip(*facts, strict=True) if own != other]
+    texts = [f"{text}, but {first_text}" for text, first_text in zip(*facts, strict=True) if text != first_text]
     is_same = all(np.allclose(getattr(run.views, name), getattr(first.views, name), atol=1e-6) for name in VECTORS)
     return texts[0] if texts else "" if is_same else "its pixels lie elsewhere than"
 

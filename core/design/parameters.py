@@ -108,8 +108,8 @@ def check_generator(generator: Mapping[str, Any], free: Mapping[str, Any]) -> No
     """Raise `InputError` for entries of a recipe's tables ``[generator]`` and ``[free]`` that its kind does not have."""
     kind = generator.get("kind", "ellipse")
     one_of(kind, GENERATORS, "generator.kind")
-    others: Mapping[str, Callable[..., Any]] = {"polygon": plate_rings, "workbook": displacement_parameters}
-    inner = others.get(kind, ellipse_rings)
+    functions: Mapping[str, Callable[..., Any]] = {"polygon": plate_rings, "workbook": displacement_parameters}
+    inner = functions.get(kind, ellipse_rings)
     names = ["kind", *signature(GENERATORS[kind]).parameters, *signature(inner).parameters]
     names += ["file", "modules"] if kind == "workbook" else []
     expected = [name for name in dict.fromkeys(names) if name not in _DERIVED]

@@ -124,16 +124,16 @@ def find_spots(
     n_u, n_v = np.minimum(2 * (np.ceil(reach.max(axis=0)).astype(int) + _MARGIN) + 1, size)
     background = np.broadcast_to(background, images.shape)
     cut = map(partial(_cut_windows, model, (n_v, n_u)), images, background, radii)
-    seen, values, first, windows, known = map(np.array, zip(*cut, strict=True))
+    has_spot, values, first, windows, known_background = map(np.array, zip(*cut, strict=True))
     if start is not None:
-        values = np.where((start.seen & seen)[..., None], start.values, values)
-    nothing = np.zeros((*seen.shape, 3, 3)), first, windows, known, 0.0 * seen, 0.0 * seen
-    spots = Spots(model, magnification, sigma, seen, values, *nothing)
+        values = np.where((start.seen & has_spot)[..., None], start.values, values)
+    nothing = np.zeros((*has_spot.shape, 3, 3)), first, windows, known_background, 0.0 * has_spot, 0.0 * has_spot
+    spots = Spots(model, magnification, sigma, has_spot, values, *nothing)
     spots = _maximize_likelihood(spots, _FIRST_STEPS if start is None else 0, progress)
     pixels = (spots.centers - model.lattice.first) / model.lattice.step
     inside = np.minimum(pixels, size - 1 - pixels) + 0.5 >= spots.values[..., 2, None] / pitch
     inside &= np.abs(pixels - first - [n_u // 2, n_v // 2]) < [n_u // 2, n_v // 2]
-    return replace(spots, seen=seen & inside.all(axis=2))
+    return replace(spots, seen=has_spot & inside.all(axis=2))
 
 
 def _cut_windows(
@@ -152,14 +152,15 @@ def _cut_windows(
     brightest, size = np.stack([column, row], axis=1), np.array(lattice.shape[::-1])
     first = np.clip(brightest - [n_u // 2, n_v // 2], 0, size - [n_u, n_v])
     columns, rows = first[:, 0, None, None] + np.arange(n_u), first[:, 1, None, None] + np.arange(n_v)[:, None]
-    windows, known = (x[np.arange(len(x))[:, None, None], rows, columns] for x in (counts, background))
-    excess = windows - known - uniform[:, None, None]
+    windows, known_background = (x[np.arange(len(x))[:, None, None], rows, columns] for x in (counts, background))
+    excess = windows - known_background - uniform[:, None, None]
     totals = excess.sum((1, 2))
-    seen = (totals >= _MIN_COUNTS) & (totals > _SIGNIFICANCE * np.sqrt(windows.sum((1, 2))))
+    has_spot = (totals >= _MIN_COUNTS) & (totals > _SIGNIFICANCE * np.sqrt(windows.sum((1, 2))))
     moments = (excess.sum(axis) * np.arange(n) for axis, n in ((1, n_u), (2, n_v)))
-    centroids = np.stack([moment.sum(1) / np.where(seen, totals, np.inf) for moment in moments], axis=1)
+    centroids = np.stack([moment.sum(1) / np.where(has_spot, totals, np.inf) for moment in moments], axis=1)
     centers = lattice.first + lattice.step * (first + centroids)
-    return seen, np.column_stack([centers, radii, np.maximum(totals, 1.0), uniform]), first, windows, known
+    values = np.column_stack([centers, radii, np.maximum(totals, 1.0), uniform])
+    return has_spot, values, first, windows, known_background
 
 
 def _maximize_likelihood(spots: Spots, n_first: int, progress: Progress | None) -> Spots:
@@ -184,16 +185,16 @@ def _maximize_likelihood(spots: Spots, n_first: int, progress: Progress | None) 
         gain = information[..., 5, 5] - (along * information[..., :5, 5]).sum(axis=2)
         good = seen & (chi_square <= _MAX_CHI_SQUARE * np.median(chi_square[seen])) if seen.any() else seen
         total = max(float(gain[good].sum()), 1e-30)
-        best, before = square + float(score[good].sum()) / total, square
+        best, previous = square + float(score[good].sum()) / total, square
         square = min(max(best, square / 4, limits[0]), limits[1])
-        steps = (covariance @ slope[..., :5, None])[..., 0] - along * (square - before)
+        steps = (covariance @ slope[..., :5, None])[..., 0] - along * (square - previous)
         # A step moves the centre by at most half a radius, and changes radius and counts by at most half.
-        most = 0.5 * values[..., [2, 2, 2, 3]] / np.maximum(np.abs(steps[..., :4]), 1e-30)
-        values = values + steps * np.minimum(most.min(axis=2), 1.0)[..., None]
+        allowed_shares = 0.5 * values[..., [2, 2, 2, 3]] / np.maximum(np.abs(steps[..., :4]), 1e-30)
+        values = values + steps * np.minimum(allowed_shares.min(axis=2), 1.0)[..., None]
         values[..., 2] = np.clip(values[..., 2], *(limit * radii for limit in _RADII))
         size = np.abs(steps) / np.sqrt(covariance.diagonal(axis1=2, axis2=3))
         size[..., 4] *= values[..., 4] > 1.01 * floor  # a background at its limit cannot decrease further
-        if step >= n_first and size[seen].max(initial=0.0) < _CONVERGED and abs(square - before) * total**0.5 < 0.1:
+        if step >= n_first and size[seen].max(initial=0.0) < _CONVERGED and abs(square - previous) * total**0.5 < 0.1:
             break
     values[..., 4] = np.where(values[..., 4] > 1.01 * floor, values[..., 4], 0.0)
     return replace(
@@ -206,12 +207,12 @@ def _normal_equations(spots: Spots, k: int, holds_radius: bool) -> tuple[Floats,
 
     The third array is chi-square per pixel (M,). With `holds_radius` the radii have no influence.
     """
-    values, windows, known = spots.values[k], spots.windows[k], spots.background[k]
-    shape, magnification = (known.shape[1], known.shape[2]), spots.magnification[k]
-    found = spots.model.fractions(values[:, :2], values[:, 2], spots.sigma, magnification, shape, spots.first[k])
-    fractions, gradient = found
+    values, windows, known_background = spots.values[k], spots.windows[k], spots.background[k]
+    shape, magnification = (known_background.shape[1], known_background.shape[2]), spots.magnification[k]
+    arguments = values[:, :2], values[:, 2], spots.sigma, magnification, shape, spots.first[k]
+    fractions, gradient = spots.model.fractions(*arguments)
     counts, uniform = values.T[3:, :, None, None]
-    expected = counts * fractions + uniform + known
+    expected = counts * fractions + uniform + known_background
     gradient[2] *= not holds_radius
     gradient[3] *= (spots.sigma / (2 * spots.sigma.max() ** 2))[:, None, None]
     gradient = np.stack([*counts * gradient[:3], fractions, np.ones_like(fractions), counts * gradient[3]], axis=1)

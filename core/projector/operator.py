@@ -245,9 +245,10 @@ class Projector(LinearOperator):
                 subset = self.grid, self.views[indices], self.model.of_views(indices)
                 projectors.append(copy.copy(self) if n == 1 else Projector(*subset, **self._settings))
                 projectors[-1].which = freeze(indices)
-                for part, whole in zip((projectors[-1], *projectors[-1]._parts), (self, *self._parts), strict=True):
-                    if part._pixel_parts != whole._pixel_parts:  # its images are those of the whole
-                        part._set_pixel_parts(whole._pixel_parts)
+                pairs = zip((projectors[-1], *projectors[-1]._parts), (self, *self._parts), strict=True)
+                for of_subset, of_all in pairs:
+                    if of_subset._pixel_parts != of_all._pixel_parts:  # images are those of all views
+                        of_subset._set_pixel_parts(of_all._pixel_parts)
         return projectors
 
     def __repr__(self) -> str:

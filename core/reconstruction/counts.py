@@ -150,8 +150,8 @@ class CountLoop(Loop):
         """Warn of counts in pixels that do not see the `support`, the voxels that mask and start leave above 0."""
         if support.all() or not support.any():
             return
-        seen = np.asarray(self._A(support.astype(np.float32), self.preparing()))
-        unseen, excesses = seen <= _UNSEEN * seen.max(), self.data.counts - self.data.background
+        sums_seen = np.asarray(self._A(support.astype(np.float32), self.preparing()))
+        unseen, excesses = sums_seen <= _UNSEEN * sums_seen.max(), self.data.counts - self.data.background
         excess = excesses[unseen].sum(dtype=float)
         share = excess / max(1.0, excesses.sum(dtype=float))
         if share > 0.01 and excess > 3 * np.sqrt(self.data.counts[unseen].sum(dtype=float)):  # more than chance

@@ -123,7 +123,12 @@ def test_names_beside_the_inputs_are_written(place):
 
 def test_an_output_of_another_letter_case_is_refused_where_case_does_not_matter(place, capsys, monkeypatch):
     exact = os.stat
-    monkeypatch.setattr(files.os, "stat", lambda path, **options: exact(str(path).lower(), **options))
+
+    def of_any_case(path, **options):
+        folder, name = os.path.split(path)
+        return exact(os.path.join(folder, name.lower()), **options)
+
+    monkeypatch.setattr(files.os, "stat", of_any_case)
     assert BOTH in refused_command(capsys, "backproject", "run.h5", "-o", "RUN.H5")
 
 

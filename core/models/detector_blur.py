@@ -11,6 +11,10 @@ from ..geometry.views import Views
 from ..physics.crystal import gaussian_blur
 from ..physics.energy_window import FWHM_PER_SIGMA
 
+# Standard deviation of the spline that shares out points among cells, and the least one of a blur that may include it, in
+# parts of pixels; and the largest such parts, in units of the hole's shadow.
+_SPLINE, _WIDE, _LARGEST_PART = 0.5, 0.67, 0.22
+
 
 def pixel_parts(model: Any, views: Views, grid: Grid) -> int:
     """Return the number of parts of a pixel's side to blur apart, as many as the module of `Emission` with most needs."""
@@ -23,8 +27,18 @@ def pixel_parts(model: Any, views: Views, grid: Grid) -> int:
 
 def matrices(model: Any, views: Views, m: int, parts: int) -> tuple[Floats, Floats]:
     """Return the matrices that blur view m of `Emission`, (n_v, n_v parts) along v and (n_u, n_u parts) along u."""
-    (pitch_u, pitch_v), (n_v, n_u), sigma = model.crystal_pitch(views, m), views.shape, _sigma(model, m)
-    return gaussian_blur(n_v, sigma / pitch_v, parts), gaussian_blur(n_u, sigma / pitch_u, parts)
+    sigmas = np.array([_sigma(model, m) / side for side in model.crystal_pitch(views, m)])
+    if has_wide_blur(model, views, m, parts):  # the cells have a part of it
+        sigmas = np.sqrt(sigmas**2 - (_SPLINE / parts) ** 2)
+    along_u, along_v = (gaussian_blur(n, sigma, parts) for n, sigma in zip(views.shape[::-1], sigmas.tolist(), strict=True))
+    return along_v, along_u
+
+
+def has_wide_blur(model: Any, views: Views, m: int, parts: int = 1) -> bool:
+    """Return whether the depth-dependent response leaves the blur of its spline in pixels' parts, as they are blurred more."""
+    magnification = model.system.collimator_length[m] / model.system.pinhole_distance[m]
+    largest = min(_sigma(model, m) / _WIDE, _LARGEST_PART * model.effective_diameter[m] * (1 + magnification))
+    return bool(model.is_by_depth and max(model.crystal_pitch(views, m)) < largest * parts)
 
 
 def _sigma(model: Any, m: int) -> float:

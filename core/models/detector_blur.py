@@ -27,11 +27,20 @@ def pixel_parts(model: Any, views: Views, grid: Grid) -> int:
 
 def matrices(model: Any, views: Views, m: int, parts: int) -> tuple[Floats, Floats]:
     """Return the matrices that blur view m of `Emission`, (n_v, n_v parts) along v and (n_u, n_u parts) along u."""
-    sigmas = np.array([_sigma(model, m) / side for side in model.crystal_pitch(views, m)])
-    if has_wide_blur(model, views, m, parts):  # the cells have a part of it
-        sigmas = np.sqrt(sigmas**2 - (_SPLINE / parts) ** 2)
-    along_u, along_v = (gaussian_blur(n, sigma, parts) for n, sigma in zip(views.shape[::-1], sigmas.tolist(), strict=True))
-    return along_v, along_u
+    (pitch_u, pitch_v), (n_v, n_u), is_wide = model.crystal_pitch(views, m), views.shape, has_wide_blur(model, views, m, parts)
+    blur = _rest_of_blur if is_wide else gaussian_blur
+    return blur(n_v, _sigma(model, m) / pitch_v, parts), blur(n_u, _sigma(model, m) / pitch_u, parts)
+
+
+def _rest_of_blur(n: int, sigma: float, parts: int) -> Floats:
+    """Return the matrix as `gaussian_blur`, for means that have the blur of the spline already."""
+    rest = math.sqrt(sigma**2 - (_SPLINE / parts) ** 2)
+    matrix = gaussian_blur(n, rest, parts)
+    # At the image's ends as many photons leave it as by the whole blur: of even ones sigma / sqrt(2 pi) at either end.
+    lost = (sigma - rest) * parts / math.sqrt(2 * math.pi)
+    for end in (0, -1):
+        matrix[:, end] *= 1 - lost / matrix[:, end].sum()
+    return matrix
 
 
 def has_wide_blur(model: Any, views: Views, m: int, parts: int = 1) -> bool:

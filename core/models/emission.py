@@ -436,8 +436,8 @@ class Emission(Model):
         lengths = self.system.collimator_length + [module.mean_depth for module in effects]
 
         blurred = [detector_blur.has_wide_blur(self, views, m) for m in range(len(self.system))]
-        modules = self._frames, lengths, plain.effective_diameter, sides, blurred, partial(plain._ray_weight, lengths)
-        settings: Any = self.mu, self.hole == "depth", None if self.has_one_kernel else effects
+        modules = self._frames, lengths, plain.effective_diameter, sides, partial(plain._ray_weight, lengths)
+        settings: Any = self.mu, self.hole == "depth", None if self.has_one_kernel else effects, blurred
         return PinholeOperator(views, grid, *modules, *settings)
 
     def _ray_weight(self, lengths: Floats, m: int, *, u: Floats, v: Floats) -> Floats:

@@ -63,8 +63,6 @@ class PinholeViews:
     """(M,), effective diameters of the holes, mm."""
     crystal_sides: Array
     """(M,), sides of the squares on the crystals in which photons are detected, mm."""
-    are_blurred: Sequence[bool]
-    """Whether the pixels are parts of pixels that the modules' detectors blur so much that one cell for each will do."""
     ray_weight: Callable[..., Array]
     """Weights of the lines through the centre of module m's hole to positions on its crystal, ``ray_weight(m, u=u, v=v)``.
 
@@ -76,6 +74,8 @@ class PinholeViews:
     """Whether grids that reach too close to a pinhole are refused."""
     directional_effects: Sequence[DirectionalEffects] | None = None
     """The modules' knife edges and crystals, where kernels depend on the photons' direction."""
+    are_blurred: Sequence[bool] | None = None
+    """Whether the modules' pixels are parts of pixels, blurred so much that one cell for each will do; None if none are."""
 
     def module(self, m: int) -> tuple[Array, Array, float, float]:
         """Return module m's pinhole (3,), mm, frame (3, 3), length l, mm, and effective diameter d, mm."""
@@ -144,7 +144,7 @@ class PinholeViews:
         widths = d * (1 + l / far), l / far * transverse_widths[-1]
         soft = 0.0 if effects is None else _SOFT_EDGE * effects.edge_decay * (1 + l / far)
         cells_per_pixel = _cells_of_pixel(abs(pitch[0]), *widths, soft), _cells_of_pixel(abs(pitch[1]), *widths, soft)
-        cells_per_pixel = (1, 1) if self.are_blurred[m] else cells_per_pixel
+        cells_per_pixel = (1, 1) if self.are_blurred and self.are_blurred[m] else cells_per_pixel
         _, middle, largest = sorted((*widths, np.abs(pitch).min()))
         sharpness = math.sqrt(middle * largest)
         half_diagonal = float(np.linalg.norm(self.grid.spacing)) / 2

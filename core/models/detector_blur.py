@@ -48,7 +48,7 @@ def _rest_of_blur(n: int, sigma: float, parts: int) -> Floats:
 
 
 def has_wide_blur(model: Any, views: Views, m: int, parts: int = 1) -> bool:
-    """Return whether the depth-dependent response leaves the blur of its spline in pixels' parts, as they are blurred more."""
+    """Return whether the depth-dependent response leaves its spline's blur in pixels' parts, since they are blurred more."""
     magnification = model.system.collimator_length[m] / model.system.pinhole_distance[m]
     largest = min(_sigma(model, m) / _WIDE, _LARGEST_PART * model.effective_diameter[m] * (1 + magnification))
     return bool(model.is_by_depth and max(model.crystal_pitch(views, m)) < largest * parts)

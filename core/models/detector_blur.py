@@ -11,6 +11,10 @@ from ..geometry.views import Views
 from ..physics.crystal import gaussian_blur
 from ..physics.energy_window import FWHM_PER_SIGMA
 
+# Standard deviation of the spline that shares out points among cells, and the least one of a blur that may include it, in
+# parts of pixels; and the largest such parts, in units of the hole's shadow.
+_SPLINE, _WIDE, _LARGEST_PART = 0.5, 0.67, 0.22
+
 
 def pixel_parts(model: Any, views: Views, grid: Grid) -> int:
     """Return the number of parts of a pixel's side to blur apart, as many as the module of `Emission` with most needs."""
@@ -23,8 +27,31 @@ def pixel_parts(model: Any, views: Views, grid: Grid) -> int:
 
 def matrices(model: Any, views: Views, m: int, parts: int) -> tuple[Floats, Floats]:
     """Return the matrices that blur view m of `Emission`, (n_v, n_v parts) along v and (n_u, n_u parts) along u."""
-    (pitch_u, pitch_v), (n_v, n_u), sigma = model.crystal_pitch(views, m), views.shape, _sigma(model, m)
-    return gaussian_blur(n_v, sigma / pitch_v, parts), gaussian_blur(n_u, sigma / pitch_u, parts)
+    (pitch_u, pitch_v), (n_v, n_u), is_wide = (
+        model.crystal_pitch(views, m),
+        views.shape,
+        has_wide_blur(model, views, m, parts),
+    )
+    blur = _rest_of_blur if is_wide else gaussian_blur
+    return blur(n_v, _sigma(model, m) / pitch_v, parts), blur(n_u, _sigma(model, m) / pitch_u, parts)
+
+
+def _rest_of_blur(n: int, sigma: float, parts: int) -> Floats:
+    """Return the matrix as `gaussian_blur`, for means that have the blur of the spline already."""
+    rest = math.sqrt(sigma**2 - (_SPLINE / parts) ** 2)
+    matrix = gaussian_blur(n, rest, parts)
+    # At the image's ends as many photons leave it as by the whole blur: of even ones sigma / sqrt(2 pi) at either end.
+    lost = (sigma - rest) * parts / math.sqrt(2 * math.pi)
+    for end in (0, -1):
+        matrix[:, end] *= 1 - lost / matrix[:, end].sum()
+    return matrix
+
+
+def has_wide_blur(model: Any, views: Views, m: int, parts: int = 1) -> bool:
+    """Return whether the depth-dependent response leaves its spline's blur in pixels' parts, since they are blurred more."""
+    magnification = model.system.collimator_length[m] / model.system.pinhole_distance[m]
+    largest = min(_sigma(model, m) / _WIDE, _LARGEST_PART * model.effective_diameter[m] * (1 + magnification))
+    return bool(model.is_by_depth and max(model.crystal_pitch(views, m)) < largest * parts)
 
 
 def _sigma(model: Any, m: int) -> float:

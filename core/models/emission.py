@@ -220,7 +220,7 @@ class Emission(Model):
             raise InputError(f"emission: hole {self.hole!r} takes no points; leave them out, or use hole 'rays'")
 
     @property
-    def _is_by_depth(self) -> bool:
+    def is_by_depth(self) -> bool:
         """Whether the hole's blur is computed without rays."""
         if self.hole != "auto":
             return self.hole == "depth"
@@ -424,7 +424,7 @@ class Emission(Model):
 
     def by_depth(self, views: Views, grid: Grid) -> PinholeOperator | None:
         """Return the depth-dependent pinhole response, or None if the hole's blur is computed by rays."""
-        if not self._is_by_depth:
+        if not self.is_by_depth:
             return None
         is_bounded = self.within_crystal or self.within_walls
         sides = self.system.detector_side if is_bounded else np.full(len(self.system), np.inf)
@@ -435,8 +435,9 @@ class Emission(Model):
         effects = [DirectionalEffects.from_optics(self._optics_of(m), *size) for m, size in enumerate(sizes)]
         lengths = self.system.collimator_length + [module.mean_depth for module in effects]
 
+        blurred = [detector_blur.has_wide_blur(self, views, m) for m in range(len(self.system))]
         modules = self._frames, lengths, plain.effective_diameter, sides, partial(plain._ray_weight, lengths)
-        settings: Any = self.mu, self.hole == "depth", None if self.has_one_kernel else effects
+        settings: Any = self.mu, self.hole == "depth", None if self.has_one_kernel else effects, blurred
         return PinholeOperator(views, grid, *modules, *settings)
 
     def _ray_weight(self, lengths: Floats, m: int, *, u: Floats, v: Floats) -> Floats:
@@ -446,7 +447,7 @@ class Emission(Model):
 
     def caution(self, views: Views, grid: Grid) -> str | None:
         """Return a warning if there are too few rays for the tolerance, or None."""
-        return None if self._is_by_depth else emission_warnings.ray_caution(self, views, grid)
+        return None if self.is_by_depth else emission_warnings.ray_caution(self, views, grid)
 
     def coefficient_warnings(self) -> Iterator[str]:
         """Yield a warning for each attenuation coefficient that looks wrong; with lines apart each text once."""

@@ -18,7 +18,7 @@ from ..arrays import Array
 from ..physics.aperture import KnifeEdge
 from .depth_zone import DepthZone
 from .directional_effects import DirectionalEffects
-from .pixel_kernels import KernelSpectra, Pair, disc_transform, half_taps
+from .pixel_kernels import KernelSpectra, Pair, disc_transform, half_taps, spline_transform
 
 # Attenuation in the edge beyond which photons are neglected, and the number of Gauss nodes in the depth of the crystal.
 _MAX_ATTENUATION, _DEPTH_NODES = 7.5, 32
@@ -127,7 +127,7 @@ def balance_factors(zone: DepthZone, v: Array, u: Array) -> Array | float:
         per_cell = per_pixel / zone.cells_per_pixel[i]
         hole, _ = disc_transform((stretch + scale) * shape.hole_diameter[i] * per_cell)
         voxel = np.prod(np.sinc(scale * shape.voxel_edges[i] * per_cell[..., None]), axis=-1)
-        image = hole * voxel / np.sinc(per_cell.clip(max=_HIGHEST_FREQUENCY)) ** 3
+        image = hole * voxel / spline_transform(per_cell.clip(max=_HIGHEST_FREQUENCY), zone.cells_per_pixel[i])
         amplitudes = photons / photons.sum() * image * np.sinc(spacing * per_pixel) ** 2 / np.sinc(per_pixel)
         places = (x / stretch[:, None] - numbers.first[i]) / (numbers.pitch[i] * spacing)
         ripples.append(2 * np.einsum("nk,nkx->x", amplitudes, np.cos(2 * np.pi * orders[..., None] * places)))

@@ -74,6 +74,8 @@ class PinholeViews:
     """Whether grids that reach too close to a pinhole are refused."""
     directional_effects: Sequence[DirectionalEffects] | None = None
     """The modules' knife edges and crystals, where kernels depend on the photons' direction."""
+    are_blurred: Sequence[bool] | None = None
+    """Whether the modules' pixels are parts of pixels, blurred so much that one cell for each will do; None if none are."""
 
     def module(self, m: int) -> tuple[Array, Array, float, float]:
         """Return module m's pinhole (3,), mm, frame (3, 3), length l, mm, and effective diameter d, mm."""
@@ -142,6 +144,7 @@ class PinholeViews:
         widths = d * (1 + l / far), l / far * transverse_widths[-1]
         soft = 0.0 if effects is None else _SOFT_EDGE * effects.edge_decay * (1 + l / far)
         cells_per_pixel = _cells_of_pixel(abs(pitch[0]), *widths, soft), _cells_of_pixel(abs(pitch[1]), *widths, soft)
+        cells_per_pixel = (1, 1) if self.are_blurred and self.are_blurred[m] else cells_per_pixel
         _, middle, largest = sorted((*widths, np.abs(pitch).min()))
         sharpness = math.sqrt(middle * largest)
         half_diagonal = float(np.linalg.norm(self.grid.spacing)) / 2

@@ -16,6 +16,8 @@ from ..arrays import Array
 
 # Taps below this fraction of the tap of a uniform kernel are left out: division by the spline makes some negative.
 _SMALLEST_TAP = 2e-4
+# Steps along a cell in which images are computed where pixels have one cell each, so that sharp edges cause no ripples.
+_STEPS_OF_ONE_CELL = 2
 
 Pair = tuple[int, int]
 """Two whole numbers, along v and u."""
@@ -89,11 +91,13 @@ class KernelSpectra:
         scales = np.concatenate([[2 * first[0] - first[1]], shape.image_scales, [2 * last[1] - last[0]]])
         self.shape, self.cells_per_pixel, self.half = shape, cells_per_pixel, half
         self.image_scales = scales[:, None, None]
-        self.fft_shape = [_fast_length(2 * h + 8) for h in half]
-        self.frequencies = np.fft.fftfreq(self.fft_shape[0])[:, None], np.fft.rfftfreq(self.fft_shape[1])[None]
+        self.steps = [_STEPS_OF_ONE_CELL if cells == 1 else 1 for cells in cells_per_pixel]
+        self.fft_shape = [step * _fast_length(2 * h + 8) for h, step in zip(half, self.steps, strict=True)]
+        (n_v, n_u), (step_v, step_u) = self.fft_shape, self.steps
+        self.frequencies = np.fft.fftfreq(n_v, 1 / step_v)[:, None], np.fft.rfftfreq(n_u, 1 / step_u)[None]
         f_v, f_u = self.frequencies
-        spline = (np.sinc(f_v) * np.sinc(f_u)) ** 3
-        self.pixel_by_spline = np.sinc(cells_per_pixel[0] * f_v) * np.sinc(cells_per_pixel[1] * f_u) / spline
+        splines = spline_transform(f_v, cells_per_pixel[0]) * spline_transform(f_u, cells_per_pixel[1])
+        self.pixel_by_spline = np.sinc(cells_per_pixel[0] * f_v) * np.sinc(cells_per_pixel[1] * f_u) / splines
         self.radius = np.hypot(shape.hole_diameter[0] * f_v, shape.hole_diameter[1] * f_u)
         self.waves = [edge[0] * f_v + edge[1] * f_u for edge in shape.voxel_edges.T]
         self.sincs = [np.sinc(self.image_scales * wave) for wave in self.waves]
@@ -119,7 +123,8 @@ class KernelSpectra:
 
     def to_taps(self, spectra: Array) -> Array:
         """Return the inverse Fourier transform of `spectra`, around the central tap."""
-        images = np.roll(np.fft.irfft2(spectra, self.fft_shape), self.half, (1, 2))  # type: ignore[arg-type]
+        images = np.fft.irfft2(spectra, self.fft_shape)[:, :: self.steps[0], :: self.steps[1]]  # type: ignore[arg-type]
+        images = np.roll(images * math.prod(self.steps), self.half, (1, 2))
         return images[:, : 2 * self.half[0] + 1, : 2 * self.half[1] + 1]
 
     def to_taps_adjoint(self, d_images: Array) -> Array:
@@ -127,10 +132,12 @@ class KernelSpectra:
 
         The real part of the sum of its conjugate times a change of the spectra is the change of the loss.
         """
-        n_v, n_u = self.fft_shape
-        padded = np.zeros((len(d_images), n_v, n_u))
+        (n_v, n_u), (step_v, step_u) = self.fft_shape, self.steps
+        padded = np.zeros((len(d_images), n_v // step_v, n_u // step_u))
         padded[:, : d_images.shape[1], : d_images.shape[2]] = d_images
-        d_spectra: Array = np.fft.rfft2(np.roll(padded, (-self.half[0], -self.half[1]), (1, 2))) / (n_v * n_u)
+        steps = np.zeros((len(d_images), n_v, n_u))
+        steps[:, ::step_v, ::step_u] = np.roll(padded, (-self.half[0], -self.half[1]), (1, 2))
+        d_spectra: Array = np.fft.rfft2(steps) / padded[0].size
         d_spectra[..., 1:-1] *= 2  # half of the spectrum of a real image is stored
         return d_spectra
 
@@ -204,6 +211,14 @@ class KernelSpectra:
         axes = zip(self.half, self.cells_per_pixel, strict=True)
         slices = [[slice((h - a) % step, None, step) for a in range(step)] for h, step in axes]
         return [(slice(None), *phase) for phase in itertools.product(*slices)]
+
+
+def spline_transform(frequencies: Array, cells: int) -> Array:
+    """Return the Fourier transform of the spline's blur that the kernels of pixels of so many `cells` undo.
+
+    It is 1 for one cell: such pixels are parts, and the spline's blur is a part of the detector's, which acts on them.
+    """
+    return np.ones_like(frequencies) if cells == 1 else np.asarray(np.sinc(frequencies) ** 3)
 
 
 def _fast_length(n: int) -> int:

@@ -143,6 +143,13 @@ class Projector(LinearOperator):
         self._bundles = Bundles(len(self.views), self._bundle)
         self._pinholes = None if self._parts else self.model.by_depth(self._fine_views, self.grid)
 
+    def _take_pixel_parts(self, of_all: Projector) -> None:
+        """Compute images with as many parts of pixels as `of_all`, and so on with the model's parts and with theirs."""
+        if self._pixel_parts != of_all._pixel_parts:
+            self._set_pixel_parts(of_all._pixel_parts)
+        for part, of_part in zip(self._parts, of_all._parts, strict=True):
+            part._take_pixel_parts(of_part)
+
     @uncompiled
     def __call__(
         self, x: Volume | ArrayOrTensor, progress: Progress | None = None, mu: ArrayOrTensor = None
@@ -245,10 +252,7 @@ class Projector(LinearOperator):
                 subset = self.grid, self.views[indices], self.model.of_views(indices)
                 projectors.append(copy.copy(self) if n == 1 else Projector(*subset, **self._settings))
                 projectors[-1].which = freeze(indices)
-                pairs = zip((projectors[-1], *projectors[-1]._parts), (self, *self._parts), strict=True)
-                for of_subset, of_all in pairs:
-                    if of_subset._pixel_parts != of_all._pixel_parts:  # images are those of all views
-                        of_subset._set_pixel_parts(of_all._pixel_parts)
+                projectors[-1]._take_pixel_parts(self)  # images are those of all views
         return projectors
 
     def __repr__(self) -> str:

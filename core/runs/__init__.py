@@ -8,7 +8,7 @@
 To add a setting, add a row to `_DECLARED` in settings.py; options, panels, recipe files, records and event sets follow.
 
 - A setting ``model.…`` is also an argument of that name of the model's class (`core/models/emission.py`); one of hole,
-  edge, cone or crystal is a field of `Optics` as well. What needs rays stands in `Emission._is_by_depth`, what presets
+  edge, cone or crystal is a field of `Optics` as well. What needs rays stands in `Emission.is_by_depth`, what presets
   decide in `_RESET` (presets.py). Settings of the detector and the backend are passed on in run_recipe.py.
 - Counts besides the volume's are the model's background, from `recipe_model` (run_recipe.py). What is not linear in the
   volume, as dead time, is no part of a model: `Imaging` (projecting.py) applies it to a run's images, and counting.py

@@ -27,13 +27,9 @@ def pixel_parts(model: Any, views: Views, grid: Grid) -> int:
 
 def matrices(model: Any, views: Views, m: int, parts: int) -> tuple[Floats, Floats]:
     """Return the matrices that blur view m of `Emission`, (n_v, n_v parts) along v and (n_u, n_u parts) along u."""
-    (pitch_u, pitch_v), (n_v, n_u), is_wide = (
-        model.crystal_pitch(views, m),
-        views.shape,
-        has_wide_blur(model, views, m, parts),
-    )
-    blur = _rest_of_blur if is_wide else gaussian_blur
-    return blur(n_v, _sigma(model, m) / pitch_v, parts), blur(n_u, _sigma(model, m) / pitch_u, parts)
+    (pitch_u, pitch_v), (n_v, n_u), sigma = model.crystal_pitch(views, m), views.shape, _sigma(model, m)
+    blur = _rest_of_blur if has_wide_blur(model, views, m, parts) else gaussian_blur
+    return blur(n_v, sigma / pitch_v, parts), blur(n_u, sigma / pitch_u, parts)
 
 
 def _rest_of_blur(n: int, sigma: float, parts: int) -> Floats:

@@ -431,15 +431,21 @@ def _model_contents(recipe: TrainingRecipe, source: Source, samples: Samples, la
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Silence Lightning's reports and warnings; errors are still raised."""
+    """Silence Lightning's reports and warnings, and tracebacks of TensorBoard's thread; errors are still raised."""
+    hook = threading.excepthook
     logs = [logging.getLogger(name) for name in ("lightning.pytorch", "lightning.fabric")]
     levels = [log.level for log in logs]
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", module=r"(lightning|torch)\b")
         for log in logs:
             log.setLevel(logging.ERROR)
+        threading.excepthook = lambda thread: None if issubclass(thread.exc_type, OSError) else hook(thread)
         try:
             yield
         finally:
+            for thread in threading.enumerate():
+                if type(thread).__module__.startswith("tensorboard."):
+                    thread.join(1)  # it may still be failing
+            threading.excepthook = hook
             for log, level in zip(logs, levels, strict=True):
                 log.setLevel(level)

@@ -142,7 +142,6 @@ def test_a_judgement_killed_beside_a_renaming_goes_on_with_the_same_scores(monke
 def test_killed_beside_any_renaming_a_work_goes_on(monkeypatch, trained, tmp_path, command, least):
     without = TRAINED if command is training else ("judgement",)
     count = killed_and_resumed(monkeypatch, trained, tmp_path, range(200), command, *without)
-    print(count)
     assert least < count < 200
 
 
@@ -161,7 +160,6 @@ def test_killed_at_random_moments_a_work_goes_on(trained, tmp_path, command):
     assert done.returncode == 0 and "Traceback" not in done.stderr, done.stderr
     statuses = json.loads(done.stdout.splitlines()[-1])
     assert {statuses[0], *statuses[2::2]} == {0} and statuses[1::2].count(-9) > 10, statuses
-    print(statuses)
     for place in places:
         check(place, trained, command)
 
@@ -220,6 +218,5 @@ def test_a_full_disk_is_one_line_and_the_next_call_goes_on(trained, disk, monkey
     while said := refusal(disk, 4096 * len(refusals) * (1 if kept != "nothing" else 8), words, capfd):
         assert "(No space left on device)" in said or "are free" in said, said
         refusals.append(said)
-    print(*refusals, sep="\n")
     assert len(refusals) > 1
     check(disk, trained, command)

@@ -61,7 +61,7 @@ class Source:
         return events
 
     def restrict(self, numbers: Collection[int]) -> None:
-        """Use the events of these numbers only; raise `InputError` if some are gone."""
+        """Keep the events of these numbers only; raise `InputError` if some are gone."""
         if gone := sorted({*numbers} - {*self.events.numbers}):
             problem = f"the training has begun with events that are gone: {several(gone)}"
             raise InputError(f"data.events: {problem}; put them back, or choose another -o")

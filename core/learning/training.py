@@ -32,7 +32,7 @@ from torch import Tensor
 from torch.utils.data import DataLoader
 
 from ..errors import InputError, first_line, naming, refusing, warn
-from ..files import AnyPath, ensure_folder, locked, remove_leftovers, require_ending, write_bytes
+from ..files import AnyPath, ensure_folder, locked, read_bytes, remove_leftovers, require_ending, write_bytes
 from ..progress import Progress, Stages
 from .data import Samples, Source, prepare_samples
 from .judging.sets import events_by_recipe, set_fingerprint, truths_of
@@ -150,7 +150,7 @@ class _RoundBatches(pl.LightningDataModule):
         self.train, self.validation, self.recipe, self.length = train, validation, recipe, length
 
     def setup(self, stage: str) -> None:
-        """Use the first process's samples in all processes: the set may have grown before another one began."""
+        """Give all processes the samples of the first one: the set may have grown before another one began."""
         for samples in (self.train, self.validation):
             samples.draws = self._trainer.strategy.broadcast(samples.draws)
 
@@ -191,9 +191,10 @@ class _SealedCheckpoints(TorchCheckpointIO):
 
     def save_checkpoint(self, checkpoint: dict[str, Any], path: AnyPath, storage_options: Any = None) -> None:
         """Write a checkpoint; a damaged one does not replace that of the round before."""
-        with suppress(InputError):
-            read_sealed(Path(path), "checkpoint")
-            os.replace(path, Path(path).with_name(_EARLIER))
+        if Path(path).exists():
+            with suppress(Damaged):
+                read_sealed(Path(path), "checkpoint")
+                write_bytes(Path(path).with_name(_EARLIER), read_bytes(path))
         write_sealed(path, checkpoint)
 
     def load_checkpoint(self, path: AnyPath, *_: Any, **__: Any) -> dict[str, Any]:

@@ -153,7 +153,7 @@ class Source:
 
 
 class Samples(Dataset[Sample]):
-    """Dataset of samples without the batch axis, kept in sealed files; a damaged one is made again, which is said."""
+    """Dataset of samples without the batch axis, kept in sealed files, which are made where they are missing or damaged."""
 
     def __init__(self, source: Source, folder: Path, draws: Sequence[Draw]) -> None:
         self.source, self.folder, self.draws = source, folder, draws
@@ -162,37 +162,28 @@ class Samples(Dataset[Sample]):
         return len(self.draws)
 
     def __getitem__(self, index: int) -> Sample:
-        draw = self.draws[index]
-        path = _path(self.folder, draw)
-        try:
-            content = read_sealed(path, "sample")[0]
-            if content["of"] != [self.source.fingerprint, *draw]:
-                raise Damaged(f"{path}: a sample of another event or draw")
-        except Damaged as error:
-            warn(f"{error}; it is made again", 1)  # under this module's name: Lightning's warnings are silenced
-            content = self.write(draw)
+        content = self._read(self.draws[index]) or self._write(self.draws[index])
         return Sample(*(content[name] for name in Sample._fields))
 
-    def write(self, draw: Draw) -> dict[str, Any]:
+    def _read(self, draw: Draw) -> dict[str, Any]:
+        """Return the content of a sample's file; nothing if it is missing or, with a warning, if it is damaged."""
+        if not (path := _path(self.folder, draw)).exists():
+            return {}
+        try:
+            content: dict[str, Any] = read_sealed(path, "sample")[0]
+            if content["of"] != [self.source.fingerprint, *draw]:
+                raise Damaged(f"{path}: a sample of another event or draw")
+            return content
+        except Damaged as error:
+            warn(f"{error}; it is made again", 1)  # under this module's name: Lightning's warnings are silenced
+            return {}
+
+    def _write(self, draw: Draw) -> dict[str, Any]:
         """Compute a sample, write its file, and return the file's content."""
         arrays = {name: values[0] for name, values in self.source.sample(draw)._asdict().items()}
         content = {"of": [self.source.fingerprint, *draw], **arrays}
         write_sealed(_path(self.folder, draw), content)
         return content
-
-
-class _MissingSamples(Dataset[int]):
-    """Dataset whose items write the files of missing samples, for loaders with any number of processes."""
-
-    def __init__(self, samples: Samples) -> None:
-        self.samples = samples
-
-    def __len__(self) -> int:
-        return len(self.samples)
-
-    def __getitem__(self, index: int) -> int:
-        self.samples.write(self.samples.draws[index])
-        return index
 
 
 def prepare_samples(
@@ -235,7 +226,8 @@ def prepare_samples(
     missing = [draw for split_draws in draws for draw in split_draws if _path(folder, draw).name not in existing]
     _check_disk(folder, len(missing) * source.size)
     loader_options = {} if workers == 1 else {"num_workers": workers, "multiprocessing_context": "spawn"}
-    loader = DataLoader(_MissingSamples(Samples(source, folder, missing)), batch_size=None, **loader_options)
+    # Each process writes files, and returns no more than the number of a sample's fields.
+    loader = DataLoader(Samples(source, folder, missing), batch_size=None, collate_fn=len, **loader_options)
     for n_done, _ in enumerate(loader if missing else (), 1):
         tell(progress, n_done, len(missing))
     return [Samples(source, folder, split_draws) for split_draws in draws]

@@ -82,6 +82,14 @@ def test_a_damaged_checkpoint_is_replaced_by_the_round_before(folder, trained, p
     assert not warned(lambda: train(folder)), "what was damaged has been replaced"
 
 
+def test_a_checkpoint_that_is_gone_is_replaced_too_and_so_is_a_sample(folder, trained):
+    (folder / "m-training" / LAST).unlink()
+    next(iter(folder.glob("samples-*/*.pt"))).unlink()
+    (said,) = warned(lambda: train(folder))
+    assert said.endswith("last.ckpt: missing; the training goes on from the round before")
+    assert same_weights(mph.learning.read_model(folder / "m.pt"), mph.learning.read_model(trained / "m.pt"))
+
+
 def test_damaged_in_both_rounds_or_of_an_earlier_version_a_training_begins_again(folder, trained):
     whole, kept = mph.learning.read_model(trained / "m.pt"), folder / "m-training"
     earlier_version = io.BytesIO()

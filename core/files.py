@@ -195,9 +195,9 @@ def is_leftover(path: Path) -> bool:
     return False
 
 
-def remove_leftovers(folder: Path) -> None:
-    """Remove the temporary files in `folder` that nobody writes any more (`is_leftover`)."""
-    for path in filter(is_leftover, folder.glob(".*")):
+def remove_leftovers(folder: Path, names: str = ".*") -> None:
+    """Remove the temporary files in `folder`, those whose `names` fit, that nobody writes any more (`is_leftover`)."""
+    for path in filter(is_leftover, folder.glob(names)):
         path.unlink(missing_ok=True)
 
 

@@ -4,23 +4,22 @@ They are computed once, into a folder whose name is a hash of everything they de
 """
 
 import hashlib
-import io
 import json
+import math
 import shutil
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-import torch
-from numpy.typing import NDArray
 from torch.utils.data import DataLoader, Dataset
 
-from ..errors import InputError, naming, warn
+from ..errors import InputError, naming, several, warn
 from ..events.event_set import COUNTED, Event, EventSet
 from ..events.noise_choice import mixed_seed
-from ..files import ensure_folder, remove_leftovers, write_bytes
+from ..files import ensure_folder, remove_leftovers
 from ..memory import readable_size
 from ..progress import Progress, tell
 from ..runs.reconstructing import inverse_crime_notes, reconstruction_model
@@ -28,9 +27,10 @@ from ..runs.run import ProjectionRun
 from ..runs.run_recipe import projector_of_run
 from ..volumes.resampling import resample
 from .recipe import TrainingRecipe
+from .seals import Damaged, read_sealed, write_sealed
 from .setup import Sample, ScannerSetup
 
-_VERSION = 1
+_VERSION = 2
 """Version of the contents of sample files."""
 _LARGE = 2**32
 """Disk space, bytes, from which on a warning is given."""
@@ -53,12 +53,25 @@ class Source:
 
     @cached_property
     def events(self) -> EventSet:
-        """All events of the set."""
+        """All events of the set, as they are at the first access; or those of `restrict`."""
         path = self.recipe.path("data.events")
         with naming("data.events"):
             if not len(events := EventSet(path)):
                 raise InputError(f"{path}: it holds no events")
         return events
+
+    def restrict(self, numbers: Collection[int]) -> None:
+        """Keep the events of these numbers only; raise `InputError` if some are gone."""
+        if gone := sorted({*numbers} - {*self.events.numbers}):
+            problem = f"the training has begun with events that are gone: {several(gone)}"
+            raise InputError(f"data.events: {problem}; put them back, or choose another -o")
+        self.events = self.events.where(lambda row: row["event"] in numbers)
+
+    @property
+    def used(self) -> EventSet:
+        """Events of the splits for training and validation."""
+        with naming("data"):
+            return self.events.split(self.recipe["data.train"]) + self.events.split(self.recipe["data.validation"])
 
     @cached_property
     def model(self) -> str:
@@ -96,12 +109,11 @@ class Source:
         """Shares of the acquisition time."""
         return self.recipe["data.levels"] or self.events.recipe.levels
 
-    @cached_property
-    def kind(self) -> np.dtype[np.void]:
-        """Data type of a sample's file: the fields of `Sample` without the batch axis."""
-        (m, n_v, n_u), grid = self.setup.A.shape_out, self.recipe.grid.shape
-        shapes = ((m, n_v, n_u), (m, n_v, n_u), (len(self.setup.after), *grid), (), grid)
-        return np.dtype([(name, "<f4", shape) for name, shape in zip(Sample._fields, shapes, strict=True)])
+    @property
+    def size(self) -> int:
+        """Size of a sample's arrays, bytes."""
+        n_volumes, A = len(self.setup.after) + 1, self.setup.A
+        return 4 * (2 * math.prod(A.shape_out) + n_volumes * math.prod(A.shape_in))
 
     @cached_property
     def fingerprint(self) -> str:
@@ -140,41 +152,38 @@ class Source:
         return {event.number: event for event in self.events}
 
 
-class _SampleWriter(Dataset[int]):
-    """Dataset whose items write the files of missing samples, for loaders with any number of processes."""
-
-    def __init__(self, source: Source, folder: Path, missing: Sequence[Draw]) -> None:
-        self.source, self.folder, self.missing = source, folder, missing
-
-    def __len__(self) -> int:
-        return len(self.missing)
-
-    def __getitem__(self, index: int) -> int:
-        sample, memory = self.source.sample(self.missing[index]), io.BytesIO()
-        record = np.zeros((), self.source.kind)
-        for name, values in zip(Sample._fields, sample, strict=True):
-            record[name] = values[0].numpy()
-        np.save(memory, record)
-        write_bytes(_path(self.folder, self.missing[index]), memory.getbuffer())
-        return index
-
-
 class Samples(Dataset[Sample]):
-    """Dataset of samples without the batch axis, read from the files of `prepare_samples`."""
+    """Dataset of samples without the batch axis, kept in sealed files, which are made where they are missing or damaged."""
 
-    def __init__(self, folder: Path, draws: Sequence[Draw]) -> None:
-        self.folder, self.draws = folder, draws
+    def __init__(self, source: Source, folder: Path, draws: Sequence[Draw]) -> None:
+        self.source, self.folder, self.draws = source, folder, draws
 
     def __len__(self) -> int:
         return len(self.draws)
 
-    def record(self, index: int) -> NDArray[np.void]:
-        """Return a sample's arrays by name, mapped from the disk."""
-        return np.load(_path(self.folder, self.draws[index]), mmap_mode="r")
-
     def __getitem__(self, index: int) -> Sample:
-        record = self.record(index)
-        return Sample(*(torch.from_numpy(np.array(record[name])) for name in Sample._fields))
+        content = self._read(self.draws[index]) or self._write(self.draws[index])
+        return Sample(*(content[name] for name in Sample._fields))
+
+    def _read(self, draw: Draw) -> dict[str, Any]:
+        """Return the content of a sample's file; nothing if it is missing or, with a warning, if it is damaged."""
+        if not (path := _path(self.folder, draw)).exists():
+            return {}
+        try:
+            content: dict[str, Any] = read_sealed(path, "sample")[0]
+            if content["of"] != [self.source.fingerprint, *draw]:
+                raise Damaged(f"{path}: a sample of another event or draw")
+            return content
+        except Damaged as error:
+            warn(f"{error}; it is made again", 1)  # under this module's name: Lightning's warnings are silenced
+            return {}
+
+    def _write(self, draw: Draw) -> dict[str, Any]:
+        """Compute a sample, write its file, and return the file's content."""
+        arrays = {name: values[0] for name, values in self.source.sample(draw)._asdict().items()}
+        content = {"of": [self.source.fingerprint, *draw], **arrays}
+        write_sealed(_path(self.folder, draw), content)
+        return content
 
 
 def prepare_samples(
@@ -213,14 +222,15 @@ def prepare_samples(
     draws = [source.draws(split) for split in splits]
     folder = ensure_folder(parent / f"samples-{source.fingerprint[:16]}")
     remove_leftovers(folder)
-    existing = {path.name for path in folder.glob("*.npy")}
+    existing = {path.name for path in folder.glob("*.pt")}
     missing = [draw for split_draws in draws for draw in split_draws if _path(folder, draw).name not in existing]
-    _check_disk(folder, len(missing) * source.kind.itemsize)
+    _check_disk(folder, len(missing) * source.size)
     loader_options = {} if workers == 1 else {"num_workers": workers, "multiprocessing_context": "spawn"}
-    loader = DataLoader(_SampleWriter(source, folder, missing), batch_size=None, **loader_options)
+    # Each process writes files, and returns no more than the number of a sample's fields.
+    loader = DataLoader(Samples(source, folder, missing), batch_size=None, collate_fn=len, **loader_options)
     for n_done, _ in enumerate(loader if missing else (), 1):
         tell(progress, n_done, len(missing))
-    return [Samples(folder, split_draws) for split_draws in draws]
+    return [Samples(source, folder, split_draws) for split_draws in draws]
 
 
 def _check_disk(folder: Path, size: int) -> None:
@@ -235,4 +245,4 @@ def _check_disk(folder: Path, size: int) -> None:
 
 def _path(folder: Path, draw: Draw) -> Path:
     """Return the path of a sample's file."""
-    return folder / f"{draw[0]:06d}-{draw[1]}.npy"
+    return folder / f"{draw[0]:06d}-{draw[1]}.pt"

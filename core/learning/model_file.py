@@ -1,11 +1,6 @@
-"""Model files (.pt): a network's weights with its recipe, scanner and training data; reading one runs no code of it.
-
-The file is written by `torch.save`, so it is a zip, whose comment holds the SHA-256 of all bytes before the digest. Only
-tensors, texts and numbers are read from it.
-"""
+"""Model files (.pt), sealed: a network's weights with its recipe, scanner and training data."""
 
 import hashlib
-import io
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -18,7 +13,7 @@ import torch
 from numpy.typing import ArrayLike
 
 from ..errors import InputError, naming, reading, warn
-from ..files import AnyPath, read_bytes, require_ending, write_bytes
+from ..files import AnyPath, require_ending
 from ..geometry.grid import Grid, same_grid
 from ..progress import Progress, tell
 from ..projector import Projector
@@ -33,12 +28,10 @@ from ..volumes.volume import Volume
 from .judging.methods import JudgedMethod
 from .networks import NETWORKS
 from .recipe import TrainingRecipe, parse_recipe
+from .seals import read_sealed, write_sealed
 from .setup import ScannerSetup
 
 _FORMAT, _VERSION = "mphDRR network", 1
-_SEAL = b"mphDRR sha256 "
-_DIGEST = 64  # length of the digest, characters
-_END = b"PK\x05\x06"  # start of a zip's last record, which has 22 bytes without a comment
 ALLOWED = ("scanner", "grid", "physics")
 """Conditions of training that a user may allow to differ."""
 _NO_PHYSICS = ("time", "background")
@@ -98,31 +91,15 @@ def _physics(text: str) -> dict[str, Any]:
 def write_model(contents: ModelContents, path: AnyPath) -> None:
     """Write a model file with its seal; raise `InputError` for another ending than .pt, or if it cannot be written."""
     require_ending(path, (".pt",))
-    memory = io.BytesIO()
     about = {name: value for name, value in vars(contents).items() if name in ModelContents.__annotations__}
     weights = {name: values.detach().cpu().contiguous() for name, values in about.pop("weights").items()}
-    torch.save({"format": _FORMAT, "version": _VERSION, "weights": weights, "about": json.dumps(about)}, memory)
-    write_bytes(path, seal(memory.getvalue()))
+    write_sealed(path, {"format": _FORMAT, "version": _VERSION, "weights": weights, "about": json.dumps(about)})
 
 
-def seal(data: bytes) -> bytes:
-    """Return the bytes of a zip without a comment with the seal as its comment."""
-    assert data[-22:-18] == _END and data[-2:] == bytes(2)
-    data = data[:-2] + (len(_SEAL) + _DIGEST).to_bytes(2, "little") + _SEAL
-    return data + hashlib.sha256(data).hexdigest().encode()
-
-
-def _read_sealed(path: Path) -> tuple[ModelContents, str]:
+def _read_contents(path: Path) -> tuple[ModelContents, str]:
     """Read a file's contents and digest; raise `InputError` if it is damaged or holds anything but data."""
-    data = read_bytes(path)
-    body, digest = data[:-_DIGEST], data[-_DIGEST:].decode("latin-1")
+    saved, digest = read_sealed(path, "model file")
     with naming(path):
-        if not body.endswith(_SEAL):
-            raise InputError("no model file of mphDRR, or cut: its seal is missing")
-        if hashlib.sha256(body).hexdigest() != digest:
-            raise InputError("damaged: its bytes are not those that were written")
-        with reading(path, "a model: it holds more than numbers and texts, nothing of which was run"):
-            saved = torch.load(io.BytesIO(data), map_location="cpu", weights_only=True)
         if not isinstance(saved, dict) or saved.get("format") != _FORMAT:
             raise InputError("no model file of mphDRR")
         if saved["version"] != _VERSION:
@@ -283,7 +260,7 @@ class TrainedNetwork:
 
 def read_model(path: AnyPath) -> TrainedNetwork:
     """Read the network of a model file; raise `InputError` if it is damaged or holds anything but data."""
-    contents, digest = _read_sealed(Path(path))
+    contents, digest = _read_contents(Path(path))
     return TrainedNetwork(Path(path), digest, contents)
 
 

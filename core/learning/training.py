@@ -7,12 +7,15 @@ distributes the work over GPUs and nodes, so that this code need not.
 import json
 import logging
 import math
+import os
 import signal
 import threading
 import time
 import warnings
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager, nullcontext, suppress
+from dataclasses import replace
+from glob import escape
 from pathlib import Path
 from typing import Any
 
@@ -21,24 +24,27 @@ import numpy as np
 import torch
 from lightning.pytorch.callbacks import Callback, EMAWeightAveraging, ModelCheckpoint
 from lightning.pytorch.loggers import TensorBoardLogger
+from lightning.pytorch.plugins.io import TorchCheckpointIO
+from lightning.pytorch.utilities import rank_zero_only
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 from numpy.typing import NDArray
 from torch import Tensor
 from torch.utils.data import DataLoader
 
-from ..errors import InputError, first_line, naming, reading
-from ..files import AnyPath, ensure_folder, read_text, require_ending, write_bytes
+from ..errors import InputError, first_line, naming, refusing, warn
+from ..files import AnyPath, ensure_folder, locked, read_bytes, remove_leftovers, require_ending, write_bytes
 from ..progress import Progress, Stages
 from .data import Samples, Source, prepare_samples
 from .judging.sets import events_by_recipe, set_fingerprint, truths_of
 from .model_file import ModelContents, TrainedNetwork, read_model, write_model
 from .networks import NETWORKS
 from .recipe import OPTIMIZERS, TrainingRecipe
+from .seals import Damaged, read_sealed, write_sealed
 from .setup import Sample, ScannerSetup
 
 _INTERMEDIATE_WEIGHT = 0.3  # weight in the loss of each estimate before the last
 _ROUNDS, _MAX_ROUND = 20, 200  # number of rounds of a training; steps of a round at most, with more rounds if necessary
-_LAST = "last.ckpt"
+_LAST, _EARLIER = "last.ckpt", "last-but-one.ckpt"  # checkpoints of the last round and of the round before
 _VALIDATED = 32  # number of validation samples at the end of each round
 
 
@@ -54,12 +60,25 @@ def training_loss(estimates: list[Tensor], truth: Tensor) -> Tensor:
     return last + _INTERMEDIATE_WEIGHT * sum(intermediate)  # type: ignore[no-any-return]
 
 
-class NetworkTraining(pl.LightningModule):
-    """Lightning module of a network: loss, optimiser, learning rate, and the learning curve, which checkpoints keep."""
+def _require_finite(values: Iterable[Tensor], name: str, step: int, recipe: TrainingRecipe) -> None:
+    """Raise `InputError`, which says what to try, if some of the values, such as "the loss is", are not finite."""
+    if not all(bool(value.isfinite().all()) for value in values):
+        remedy = f"try a smaller training.rate than {recipe['training.rate']:g}, and another -o"
+        raise InputError(f"training: step {step}: {name} not finite; {remedy}")
 
-    def __init__(self, network: torch.nn.Module, setup: Callable[[], ScannerSetup], recipe: TrainingRecipe):
+
+class NetworkTraining(pl.LightningModule):
+    """Lightning module of a network: loss, optimiser, learning rate, and what checkpoints keep: learning curve and plan.
+
+    The `plan` is what a resumed training shares with its beginning. The training ends with an `InputError` as soon as loss,
+    weights or validation are not finite.
+    """
+
+    def __init__(
+        self, network: torch.nn.Module, setup: Callable[[], ScannerSetup], recipe: TrainingRecipe, plan: dict[str, Any]
+    ):
         super().__init__()
-        self.network = network
+        self.network, self.plan = network, plan
         self.get_setup = setup  # a function, so that weight averaging does not copy the setup with the module
         self.recipe, self.steps = recipe, recipe["training.steps"]
         self.curve: list[dict[str, float]] = []
@@ -76,8 +95,13 @@ class NetworkTraining(pl.LightningModule):
         estimates = self.network(self.get_setup(), batch)
         self._losses.append(nrmse(estimates[-1].detach()[:, 0].float(), batch.truth))
         loss = training_loss(estimates, batch.truth)
+        _require_finite([loss], "the loss is", self.global_step + 1, self.recipe)
         self.log("loss", loss.detach(), sync_dist=True)
         return loss
+
+    def on_train_batch_end(self, *_: Any) -> None:
+        """Check the weights after each step."""
+        _require_finite(self.network.state_dict().values(), "the weights are", self.global_step, self.recipe)
 
     def validation_step(self, batch: Sample) -> None:
         """Log the NRMSE of the averaged weights on a batch."""
@@ -89,18 +113,19 @@ class NetworkTraining(pl.LightningModule):
         train, self._losses = torch.stack(self._losses).mean(), []
         now = time.monotonic()
         self.seconds, self._resumed_at = self.seconds + now - self._resumed_at, now
-        validation = self.trainer.callback_metrics.get("validation")
+        validation = self.trainer.callback_metrics["validation"]
+        _require_finite([validation], "the validation is", self.global_step, self.recipe)
         self.curve.append({
             "step": self.global_step,
             "seconds": round(self.seconds, 2),
             "events": self.global_step * self.recipe["training.batch"],
             "train": float(self.trainer.strategy.reduce(train, reduce_op="mean")),
-            "validation": math.nan if validation is None else float(validation),
+            "validation": float(validation),
         })  # fmt: skip
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Store the learning curve in the checkpoint."""
-        checkpoint["curve"], checkpoint["spent"] = self.curve, self.seconds
+        """Store the learning curve and the plan in the checkpoint."""
+        checkpoint |= {"curve": self.curve, "spent": self.seconds, "plan": self.plan}
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Restore the learning curve from the checkpoint."""
@@ -124,6 +149,11 @@ class _RoundBatches(pl.LightningDataModule):
         super().__init__()
         self.train, self.validation, self.recipe, self.length = train, validation, recipe, length
 
+    def setup(self, stage: str) -> None:
+        """Give all processes the samples of the first one: the set may have grown before another one began."""
+        for samples in (self.train, self.validation):
+            samples.draws = self._trainer.strategy.broadcast(samples.draws)
+
     def train_dataloader(self) -> DataLoader[Sample]:
         """Return the batches of the next round; the last round may be shorter."""
         batch, round_index = self.recipe["training.batch"], self._trainer.current_epoch
@@ -135,8 +165,7 @@ class _RoundBatches(pl.LightningDataModule):
 
     def val_dataloader(self) -> DataLoader[Sample]:
         """Return some of the validation samples, always the same."""
-        n = len(self.validation)
-        chosen = np.unique(np.linspace(0, n - 1, min(n, _VALIDATED)).astype(int))
+        chosen = _validated(self.validation)
         n_processes = self._trainer.world_size
         padded = np.resize(chosen, math.ceil(len(chosen) / n_processes) * n_processes)
         return DataLoader(self.validation, batch_sampler=self._process_share(padded[:, None]).tolist())
@@ -150,6 +179,47 @@ class _RoundBatches(pl.LightningDataModule):
         """Trainer that this data module belongs to."""
         assert self.trainer is not None
         return self.trainer
+
+
+def _validated(samples: Samples) -> NDArray[np.int64]:
+    """Return the indices of the validation samples that are used, always the same."""
+    return np.unique(np.linspace(0, len(samples) - 1, min(len(samples), _VALIDATED)).astype(int))
+
+
+class _SealedCheckpoints(TorchCheckpointIO):
+    """Lightning's reading and writing of checkpoints, here sealed files; the one of the round before is kept beside."""
+
+    def save_checkpoint(self, checkpoint: dict[str, Any], path: AnyPath, storage_options: Any = None) -> None:
+        """Write a checkpoint; a damaged one does not replace that of the round before."""
+        if Path(path).exists():
+            with suppress(Damaged):
+                read_sealed(Path(path), "checkpoint")
+                write_bytes(Path(path).with_name(_EARLIER), read_bytes(path))
+        write_sealed(path, checkpoint)
+
+    def load_checkpoint(self, path: AnyPath, *_: Any, **__: Any) -> dict[str, Any]:
+        """Return the content of a checkpoint."""
+        return read_sealed(Path(path), "checkpoint")[0]  # type: ignore[no-any-return]
+
+
+def last_checkpoint(folder: Path) -> tuple[Path | None, dict[str, Any]]:
+    """Return the path and the content of the last whole checkpoint in a training's folder; None if there is none.
+
+    Warns if the last one is damaged or missing.
+    """
+    problems: list[str] = []
+    for path in filter(Path.exists, (folder / _LAST, folder / _EARLIER)):
+        try:
+            content = read_sealed(path, "checkpoint")[0]
+        except Damaged as error:
+            problems.append(str(error))
+            continue
+        if path.name == _EARLIER:
+            warn(f"{(problems or [f'{folder / _LAST}: missing'])[0]}; the training goes on from the round before")
+        return path, content
+    if problems:
+        warn(f"{problems[0]}; the training begins again")
+    return None, {}
 
 
 class _ProgressReport(Callback):
@@ -200,21 +270,48 @@ def train(
     path = Path(path)
     require_ending(path, (".pt",))
     folder = ensure_folder(path.absolute().with_name(f"{path.stem}-training"))
+    refusal = f"{folder}: another process trains here; wait for its end, or choose another -o"
+    with locked(folder / ".lock", refusal) if _is_first(recipe) else nullcontext():
+        remove_leftovers(folder)
+        remove_leftovers(folder.parent, f".*-{escape(path.name)}")
+        _train(recipe, path, folder, workers, stages)
+    return read_model(path)
+
+
+def _is_first(recipe: TrainingRecipe) -> bool:
+    """Return whether this process is the first of its training, as far as the environment tells before Lightning begins."""
+    return recipe.processes == 1 or (rank_zero_only.rank == 0 and os.environ.get("NODE_RANK", "0") == "0")
+
+
+def _train(recipe: TrainingRecipe, path: Path, folder: Path, workers: int, stages: Stages) -> None:
+    """Train a network in its folder and write its model file."""
+    last, checkpoint = last_checkpoint(folder)
     source = Source(recipe)
+    plan = _plan(recipe, source, last, checkpoint)
     torch.set_num_threads(recipe["training.threads"] or torch.get_num_threads())
     network = _initial_network(recipe, source)  # raises before samples are prepared
     splits = recipe["data.train"], recipe["data.validation"]
     samples, validation = prepare_samples(source, folder.parent, splits, workers, stages("preparing"))
-    with _quiet():
-        precision = _recorded_precision(recipe, source, folder)
-        module = NetworkTraining(network, lambda: source.setup, recipe)
+    with _quiet(), refusing(folder, "cannot be written"):
+        module = NetworkTraining(network, lambda: source.setup, recipe, plan)
         length = min(_MAX_ROUND, math.ceil(recipe["training.steps"] / _ROUNDS))
-        trainer, last = _trainer(recipe, folder, precision, length, stages("training")), folder / _LAST
+        trainer = _trainer(recipe, folder, plan["precision"], length, stages("training"))
         _fit(trainer, module, _RoundBatches(samples, validation, recipe, length), last)
-    if trainer.is_global_zero:
-        write_model(_model_contents(recipe, source, samples, last), path)
-    trainer.strategy.barrier()
-    return read_model(path)
+        if trainer.is_global_zero:
+            contents = _model_contents(recipe, source, samples, folder / _LAST)
+            # Mixed precision, and a share of the samples for each process, gave a somewhat different error at the last step.
+            error = _error(TrainedNetwork(path, "", contents).network, source.setup, validation)
+            _require_finite([error], "the result is", recipe["training.steps"], recipe)
+            curve = [*contents.curve[:-1], {**contents.curve[-1], "validation": float(error)}]
+            write_model(replace(contents, curve=curve), path)
+        trainer.strategy.barrier()
+
+
+def _error(network: torch.nn.Module, setup: ScannerSetup, samples: Samples) -> Tensor:
+    """Return the mean NRMSE of a network over the validation samples that are used."""
+    with torch.no_grad():
+        batches = (Sample(*(values[None] for values in samples[i])) for i in _validated(samples).tolist())
+        return torch.stack([nrmse(network(setup, batch)[-1][:, 0].float(), batch.truth) for batch in batches]).mean()
 
 
 def _initial_network(recipe: TrainingRecipe, source: Source) -> torch.nn.Module:
@@ -232,19 +329,20 @@ def _initial_network(recipe: TrainingRecipe, source: Source) -> torch.nn.Module:
     return network
 
 
-def _recorded_precision(recipe: TrainingRecipe, source: Source, folder: Path) -> str:
-    """Return the precision of a training, which its folder records when it starts.
+def _plan(recipe: TrainingRecipe, source: Source, last: Path | None, checkpoint: dict[str, Any]) -> dict[str, Any]:
+    """Return the plan of a training, which its checkpoints keep: hashes of its recipe, its events, and its precision.
 
-    Raises `InputError` if the folder holds a training by another recipe.
+    A resumed training uses the events that it began with. Raises `InputError` if the last checkpoint is of a training by
+    another recipe.
     """
-    path, fingerprint = folder / "plan.json", f"{recipe.fingerprint} {source.fingerprint}"
-    if not (folder / _LAST).exists():
-        write_bytes(path, json.dumps({"recipe": fingerprint, "precision": _precision(recipe)}).encode())
-    with reading(path, "the plan of a training"):
-        plan = json.loads(read_text(path))
-        if plan["recipe"] != fingerprint:
-            raise InputError("of a training by another recipe: remove its folder, or choose another -o")
-        return str(plan["precision"])
+    fingerprint = [recipe.fingerprint, source.fingerprint]
+    if last is None:
+        return {"recipe": fingerprint, "events": source.used.numbers, "precision": _precision(recipe)}
+    plan: dict[str, Any] = checkpoint["plan"]
+    if plan["recipe"] != fingerprint:
+        raise InputError(f"{last}: of a training by another recipe: remove its folder, or choose another -o")
+    source.restrict(plan["events"])
+    return plan
 
 
 def _device(recipe: TrainingRecipe) -> torch.device:
@@ -287,6 +385,7 @@ def _trainer(
             enable_model_summary=False,
             log_every_n_steps=10,
             logger=TensorBoardLogger(folder, name="", version="tensorboard"),
+            plugins=[_SealedCheckpoints()],
             callbacks=[EMAWeightAveraging(decay=decay), checkpoints, _ProgressReport(folder, steps, progress)],
         )
     except (ImportError, ValueError, MisconfigurationException) as error:
@@ -294,15 +393,12 @@ def _trainer(
         raise InputError(f"training: Lightning refuses {keys}: {first_line(error)}") from None
 
 
-def _fit(trainer: pl.Trainer, module: NetworkTraining, rounds: "_RoundBatches", last: Path) -> None:
+def _fit(trainer: pl.Trainer, module: NetworkTraining, rounds: _RoundBatches, last: Path | None) -> None:
     """Train from the start or from the last checkpoint; Ctrl-C raises `KeyboardInterrupt`, as everywhere."""
-    if last.exists():
-        with reading(last, "a checkpoint; remove it to begin anew"):
-            torch.load(last, map_location="cpu", weights_only=True)
     is_main = threading.current_thread() is threading.main_thread()
     handler = signal.getsignal(signal.SIGINT)
     try:
-        trainer.fit(module, datamodule=rounds, ckpt_path=str(last) if last.exists() else None)
+        trainer.fit(module, datamodule=rounds, ckpt_path=None if last is None else str(last))
     except SystemExit:  # Lightning turns Ctrl-C into this
         raise KeyboardInterrupt from None
     finally:
@@ -312,11 +408,10 @@ def _fit(trainer: pl.Trainer, module: NetworkTraining, rounds: "_RoundBatches", 
 
 def _model_contents(recipe: TrainingRecipe, source: Source, samples: Samples, last: Path) -> ModelContents:
     """Return the contents of the model file: averaged weights of the last checkpoint, and the data of the training."""
-    checkpoint, prefix = torch.load(last, map_location="cpu", weights_only=True), "network."
+    checkpoint, prefix = read_sealed(last, "checkpoint")[0], "network."
     weights = {name.removeprefix(prefix): values for name, values in checkpoint["state_dict"].items()}
-    setup, grid = source.setup, recipe.grid
-    counts = [float(samples.record(i)["counts"].sum(dtype=float)) for i in range(len(samples))]
-    events = source.events.split(recipe["data.train"]) + source.events.split(recipe["data.validation"])
+    setup, grid, events = source.setup, recipe.grid, source.used
+    counts = [float(samples[i].counts.sum(dtype=torch.float64)) for i in range(len(samples))]
     network: Any = NETWORKS[recipe["network.kind"]].load()
     return ModelContents(
         weights,
@@ -337,15 +432,21 @@ def _model_contents(recipe: TrainingRecipe, source: Source, samples: Samples, la
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Silence Lightning's reports and warnings; errors are still raised."""
+    """Silence Lightning's reports and warnings, and tracebacks of TensorBoard's thread; errors are still raised."""
+    hook = threading.excepthook
     logs = [logging.getLogger(name) for name in ("lightning.pytorch", "lightning.fabric")]
     levels = [log.level for log in logs]
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", module=r"(lightning|torch)\b")
         for log in logs:
             log.setLevel(logging.ERROR)
+        threading.excepthook = lambda thread: None if issubclass(thread.exc_type, OSError) else hook(thread)
         try:
             yield
         finally:
+            for thread in threading.enumerate():
+                if type(thread).__module__.startswith("tensorboard."):
+                    thread.join(1)  # it may still be failing
+            threading.excepthook = hook
             for log, level in zip(logs, levels, strict=True):
                 log.setLevel(level)

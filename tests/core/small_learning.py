@@ -8,6 +8,7 @@ from pathlib import Path
 import torch
 from torch import nn
 
+from mphdrr.core.learning.model_file import TrainedNetwork
 from mphdrr.core.learning.networks import NETWORKS, NetworkKind
 from mphdrr.core.learning.recipe import TrainingRecipe, read_recipe
 
@@ -58,3 +59,9 @@ def small_training(folder: Path, events: Path, text: str = TRAINING) -> Training
     shutil.copytree(events, folder / "set")
     (folder / "training.toml").write_text(text, encoding="utf-8")
     return read_recipe(folder / "training.toml")
+
+
+def same_weights(first: TrainedNetwork, second: TrainedNetwork) -> bool:
+    """Return whether the weights of two networks are the same bit for bit."""
+    a, b = first.contents.weights, second.contents.weights
+    return a.keys() == b.keys() and all(torch.equal(a[name], b[name]) for name in a)

@@ -21,8 +21,9 @@ from mphdrr.core.cli import main
 from mphdrr.core.events import EventSet
 from mphdrr.core.learning import model_file
 from mphdrr.core.learning.judging.sets import events_by_recipe, truths_of
-from mphdrr.core.learning.model_file import read_model, seal, write_model
+from mphdrr.core.learning.model_file import read_model, write_model
 from mphdrr.core.learning.networks import NETWORKS
+from mphdrr.core.learning.seals import seal
 from mphdrr.core.reconstruction.methods import method_of
 from mphdrr.core.reconstruction.snapshots import Snapshots
 

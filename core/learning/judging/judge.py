@@ -62,7 +62,8 @@ def judge(
     if len(set(names)) < len(names):
         raise InputError(f"judge: expected methods of different names, got {', '.join(names)}")
     with locked(folder / ".lock", f"{folder}: another process judges in this folder; wait for its end"):
-        remove_leftovers(ensure_folder(folder / "scores"))
+        for place in (folder, ensure_folder(folder / "scores")):
+            remove_leftovers(place)
         judgement = _JudgeRun(recipe, folder, methods, progress).judgement()
         write_report(judgement, folder)
     return judgement

@@ -137,9 +137,10 @@ class _IterationLog:
         self.start_time, self.interrupted = time.monotonic(), False
 
     def stage(self, title: str) -> mph.Progress | None:
-        """Return the progress callback of a stage: a bar, or for the iterations the check for an interruption."""
+        """Return the progress callback of a stage: a bar, but on a terminal none of the iterations, which have lines."""
+        self.bar = progress_bar(title)
         if title != "reconstructing":
-            return progress_bar(title)
+            return self.bar
         self.start_time = time.monotonic()
         return self._check
 
@@ -147,13 +148,16 @@ class _IterationLog:
         """Note that Ctrl-C was typed, which stops the reconstruction after the current update."""
         self.interrupted = True
 
-    def _check(self, _n_done: int, total: int) -> None:
-        """Raise `Cancelled` if Ctrl-C was typed."""
+    def _check(self, n_done: int, total: int) -> None:
+        """Report the progress; raise `Cancelled` if Ctrl-C was typed."""
         if self.interrupted:
             raise mph.Cancelled
+        if not sys.stderr.isatty():
+            self.bar(n_done, total)
 
     def __call__(self, iteration: int, values: Any, objective: Sequence[float]) -> None:
         """Print the objective and the largest value after an iteration."""
+        self.bar.remark = lambda: f"{self.objective_name} {objective[-1]:.8g}"
         if not self.quiet:
             seconds = time.monotonic() - self.start_time
             line = f"{self.objective_name} {objective[-1]:.8g}, largest {float(values.max()):.4g}, {seconds:.1f} s"

@@ -3,6 +3,7 @@
 import argparse
 import inspect
 import json
+import os
 import re
 import signal
 import sys
@@ -40,6 +41,7 @@ COMMANDS = {
 INTERVAL = 60.0
 """Longest silence, s, of a command whose standard error is no terminal (`reporting`)."""
 _stage: "ProgressBar | None" = None  # that the running command is in
+_is_quiet = False  # whether the running command has --quiet
 _WIDTH = 30  # of progress bars, characters
 _LONG = r"""(?<!\w)'[^']{199,}'|(?<!\w)"[^"]{199,}"|\[[^]]{199,}\]|\S{201,}"""
 _HANGING = 15 * " "  # indent of further lines in the second column of lists in descriptions
@@ -234,7 +236,7 @@ class ProgressBar:
         if total != self._last[2] or n_done < self._last[1]:  # the first report, or that of another round
             self._first = report
         self._last, _stage = report, self if n_done < total else None
-        if sys.stderr.isatty():
+        if sys.stderr.isatty() and not _is_quiet:
             filled = _WIDTH * n_done // max(total, 1)
             text = self._status_text() if self._status_text else f"{report[0] - self._start_time:.1f} s"
             bar = f"[{'#' * filled}{'.' * (_WIDTH - filled)}]"
@@ -250,7 +252,7 @@ class ProgressBar:
         texts += [self.remark()] if self.remark else []
         if n_done > n_first:
             seconds = (time_done - first_time) / (n_done - n_first)  # of a step
-            texts.append(f"{1 / max(seconds, 1e-9):.2g} steps/s" if seconds < 1 else f"{seconds:.2g} s per step")
+            texts.append(f"{1 / max(seconds, 1e-9):.1f} steps/s" if seconds < 1 else f"{seconds:.1f} s per step")
             left = duration_text(max(0.0, seconds * (total - n_done) - idle))
             texts.append(self._status_text() if self._status_text else f"{left} left")
         return f"{self._label}: {', '.join(texts)}"
@@ -267,13 +269,15 @@ def progress_bar(label: str, status_text: Callable[[], str] | None = None) -> Pr
 
 
 @contextmanager
-def reporting(is_quiet: bool) -> Iterator[None]:
+def reporting(is_quiet: bool = False) -> Iterator[None]:
     """Print, within the block of a command, a line on its stage each `INTERVAL`, if standard error is no terminal.
 
-    A thread does it, so that a step of hours is heard, too.
+    A thread does it, so that a step of hours is heard, too. A command that `is_quiet` has neither lines nor bars, and of the
+    processes of a training on one machine only the first has.
     """
-    global _stage
+    global _stage, _is_quiet
     _stage, start_time, end = None, time.monotonic(), threading.Event()
+    _is_quiet = is_quiet or os.environ.get("LOCAL_RANK", "0") != "0"  # set by Lightning and torchrun
 
     def report() -> None:
         """Print the lines until the block ends."""
@@ -285,11 +289,12 @@ def reporting(is_quiet: bool) -> Iterator[None]:
                 say(f"at work for {elapsed}" if stage is None else stage.state())
 
     thread = threading.Thread(target=report, name="reporting", daemon=True)
-    if not is_quiet and not sys.stderr.isatty():
+    if not _is_quiet and not sys.stderr.isatty():
         thread.start()
     try:
         yield
     finally:
         end.set()
+        _is_quiet = False
         if thread.ident is not None:
             thread.join()

@@ -112,12 +112,12 @@ def test_designs_are_heard(tmp_path, heard):
 
 def test_a_calibration_is_heard(points, tmp_path, heard):  # noqa: F811
     lines = heard("geometry", "calibrate", points[0], "-o", tmp_path / "new.xlsx")
-    assert has_line(lines, f"finding spots: {STEP}")
+    assert has_line(lines, f"finding spots: {STEP}") and has_line(lines, "finding modules: no step done for 0 s")
 
 
 def test_a_step_without_an_end_in_sight_is_heard_and_so_is_work_without_steps(monkeypatch, capsys):
     monkeypatch.setattr(options, "INTERVAL", 0.05)
-    with options.reporting(False):
+    with options.reporting():
         time.sleep(0.12)
         bar = options.progress_bar("training")
         time.sleep(0.12)
@@ -138,6 +138,15 @@ def test_a_step_without_an_end_in_sight_is_heard_and_so_is_work_without_steps(mo
     assert lines[-1] == "mphdrr: at work for 0 s" and 7 <= len(lines) <= 9
 
 
+def test_of_the_processes_of_a_training_the_first_is_heard(monkeypatch, capsys):
+    monkeypatch.setattr(options, "INTERVAL", 0.005)
+    for rank in "01":
+        monkeypatch.setenv("LOCAL_RANK", rank)
+        with options.reporting():
+            time.sleep(0.05)
+        assert bool(capsys.readouterr().err) == (rank == "0")
+
+
 def test_rate_and_time_left_are_those_of_the_steps_of_this_call(monkeypatch):
     """A resumed training begins with a step far from the first, and a first step compiles."""
     now = [0.0]
@@ -146,14 +155,14 @@ def test_rate_and_time_left_are_those_of_the_steps_of_this_call(monkeypatch):
     for seconds, step in ((500.0, 2001), (510.0, 2021)):
         now[0] = seconds
         tell(bar, step, 4000, lambda: "loss 0.412")
-    assert bar.state() == "training: step 2021 of 2000, loss 0.412, 2 steps/s, 16 min left"
+    assert bar.state() == "training: step 2021 of 4000, loss 0.412, 2.0 steps/s, 16 min left"
     now[0] = 750.0
-    assert bar.state() == "training: step 2021 of 2000 for 4 min, loss 0.412, 2 steps/s, 12 min left"
+    assert bar.state() == "training: step 2021 of 4000 for 4 min, loss 0.412, 2.0 steps/s, 12 min left"
     slow = options.progress_bar("judging")
     for seconds, step in ((1000.0, 0), (1100.0, 4), (1300.0, 8)):
         now[0] = seconds
         slow(step, 12)
-    assert slow.state() == "judging: step 8 of 12, 38 s per step, 2 min left"
+    assert slow.state() == "judging: step 8 of 12, 37.5 s per step, 2 min left"
     slow(1, 12)  # another round
     assert slow.state() == "judging: step 1 of 12"
 
@@ -182,6 +191,6 @@ def test_a_closed_standard_error_stops_no_work(tmp_path, monkeypatch):
     monkeypatch.setattr(options, "INTERVAL", 0.002)
     with (tmp_path / "err").open("w") as stream:
         monkeypatch.setattr(sys, "stderr", stream)
-        with options.reporting(False):
+        with options.reporting():
             stream.close()
             time.sleep(0.02)

@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING
 from ... import events
 from ...errors import InputError
 from ...memory import readable_size
-from ...progress import tell
 from ..options import add_set_action, duration_text, print_answer, progress_bar, say
 
 if TYPE_CHECKING:
@@ -68,7 +67,7 @@ def _run(arguments: argparse.Namespace) -> None:
 def run_with_reports(work: Making, quiet: bool) -> int:
     """Make the missing events, print the size of the set and the remaining time, and return the number of events made."""
     start_time, n_done, size, remaining = time.monotonic(), 0, 0, ""
-    bar = None if quiet else progress_bar("making", lambda: f"{remaining} left")
+    bar = progress_bar("making", lambda: f"{remaining} left")
     if not quiet:
         say(f"events missing: {len(work.missing)}, {_expected_size(work)}; {readable_size(_free_bytes(work))} are free")
     for progress in work:
@@ -80,7 +79,7 @@ def run_with_reports(work: Making, quiet: bool) -> int:
             say(f"event {progress.number}: {facts}")
         if n_done in (1, 10, 100, 1000) and size * ratio > _free_bytes(work):
             say(f"warning: only {readable_size(_free_bytes(work))} are free on the disk of {work.folder.path}")
-        tell(bar, n_done, progress.total)
+        bar(n_done, progress.total)
     return n_done
 
 

@@ -40,7 +40,7 @@ def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
     parser.add_argument("-o", "--output", metavar="FILE", help=f"the volume: {', '.join(VOLUME_FORMATS)}")
     text = f"also draw slices and the objective ({', '.join(SUFFIXES)}), for a simulated run beside the truth"
     parser.add_argument("--picture", metavar="FILE", help=text)
-    parser.add_argument("--quiet", action="store_true", help="no bars, and no line for each iteration, on standard error")
+    parser.add_argument("--quiet", action="store_true", help="no bars and no lines of iterations on standard error")
     text = "write the recipe (.toml) of these options instead of reconstructing"
     parser.add_argument("--write-recipe", metavar="FILE", help=text)
 

@@ -31,13 +31,6 @@ PROJECT = ["project", str(FEWER_MODULES), *WORDS.split()]
 def heard(monkeypatch, capsys) -> Callable[..., list[str]]:
     """Return a function that runs a command with a line each few milliseconds, and returns the lines on standard error."""
     monkeypatch.setattr(options, "INTERVAL", 0.002)
-    note = options.ProgressBar.__call__
-
-    def note_and_wait(*arguments) -> None:  # so that each step lasts longer than the interval
-        note(*arguments)
-        time.sleep(0.01)
-
-    monkeypatch.setattr(options.ProgressBar, "__call__", note_and_wait)
 
     def run(*words: object) -> list[str]:
         assert main([*map(str, words)]) == 0

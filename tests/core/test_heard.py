@@ -24,7 +24,7 @@ from .test_judge import BELIEVED, SHORT_TEST
 needs_torch = pytest.mark.skipif(not find_spec("lightning"), reason="the extra learning is not installed")
 STEP = r"(no step done|step \d+ of \d+)"
 STILL = r"( for \d s)?"
-WORDS = "--phantom derenzo --emission --time 60 --voxels 48 --size 48 48"
+WORDS = "--phantom derenzo --emission --time 60 --voxels 32 --size 32 32"
 PROJECT = ["project", str(FEWER_MODULES), *WORDS.split()]
 
 
@@ -54,7 +54,7 @@ def run_file(tmp_path, heard):
 
 
 def test_projections_and_reconstructions_say_step_objective_and_time(run_file, tmp_path, heard):
-    words = ["reconstruct", run_file, "--voxels", 24, "--spacing", 5, "--iterations", 4, "-o", tmp_path / "v.nii.gz"]
+    words = ["reconstruct", run_file, "--voxels", 16, "--spacing", 7, "--iterations", 4, "-o", tmp_path / "v.nii.gz"]
     lines = heard(*words)
     objective = r"log-likelihood -?[\d.e+-]+"
     assert has_line(
@@ -89,10 +89,10 @@ def test_a_training_says_step_loss_rate_and_time_left(tmp_path, small_set, heard
     from .small_learning import TOY, small_training
 
     monkeypatch.setitem(NETWORKS, "toy", TOY)
-    small_training(tmp_path, small_set, TRAINING.replace("steps = 6", "steps = 20"))
+    small_training(tmp_path, small_set, TRAINING.replace("steps = 6", "steps = 10"))
     lines = heard("learn", "train", tmp_path / "training.toml", "-o", tmp_path / "m.pt")
     assert has_line(lines, f"preparing: {STEP}")
-    assert has_line(lines, rf"training: step \d+ of 20{STILL}, loss [\d.]+, [\d.e+]+ (steps/s|s per step), \d+ s left$")
+    assert has_line(lines, rf"training: step \d+ of 10{STILL}, loss [\d.]+, [\d.e+]+ (steps/s|s per step), \d+ s left$")
 
 
 @needs_torch

@@ -33,9 +33,14 @@ def stages_of(progress: Progress | None) -> Stages:
     return progress.stages if isinstance(progress, StagedProgress) else lambda label: progress
 
 
-def tell(progress: Progress | None, done: int, total: int) -> None:
-    """Call ``progress(done, total)`` unless `progress` is None."""
+def tell(progress: Progress | None, done: int, total: int, remark: Callable[[], str] | None = None) -> None:
+    """Call ``progress(done, total)`` unless it is None, after its attribute `remark`, if it has one, was set.
+
+    A `remark` returns a text on the last step, such as its loss.
+    """
     if progress is not None:
+        if remark is not None and hasattr(progress, "remark"):
+            progress.remark = remark
         progress(done, total)
 
 

@@ -19,7 +19,7 @@ from bpy.app.translations import pgettext_iface as iface
 from bpy.props import BoolProperty, IntProperty
 from bpy_extras.io_utils import ExportHelper
 
-from ...core.cli.options import progress_bar
+from ...core.cli.options import duration_text, progress_bar
 from ...core.errors import InputError
 from ...core.progress import Cancelled, Progress, StagedProgress
 from ...core.recording import recorded_warnings
@@ -134,7 +134,7 @@ class Worker(threading.Thread):
         if elapsed < _ESTIMATE_AFTER or not self.done:
             return stage_text
         remaining = elapsed / self.done * (self.total - self.done)
-        return f"{stage_text}, {f'{remaining:.0f} s' if remaining < 100 else f'{remaining / 60:.0f} min'} left"
+        return f"{stage_text}, {duration_text(remaining)} left"
 
     @property
     def is_stoppable(self) -> bool:

@@ -20,7 +20,7 @@ from ..errors import InputError, InputWarning
 from ..files import keeping_inputs
 from ..progress import Cancelled
 from ..version import VERSION
-from .options import COMMANDS, NotingStore, say
+from .options import COMMANDS, NotingStore, reporting, say
 
 OK, INPUT_ERROR, USAGE, INTERRUPTED = 0, 1, 2, 130
 
@@ -105,7 +105,7 @@ def _run_command(argv: Sequence[str] | None, more_commands: Mapping[str, str]) -
         warnings.simplefilter("always", InputWarning)
         warnings.showwarning = _show_warning
         try:
-            with keeping_inputs():
+            with keeping_inputs(), reporting(getattr(arguments, "quiet", False)):
                 arguments.run(arguments)
         except InputError as error:
             return _fail(str(error), INPUT_ERROR)

@@ -42,7 +42,7 @@ def _optimize(arguments: argparse.Namespace) -> None:
     path = output_path(arguments.output, (".xlsx",))
     recipe, state = mph.design.read_design_recipe(arguments.recipe), path.with_suffix(".design.json")
     try:
-        result = mph.design.optimize(recipe, None if arguments.quiet else progress_bar("designing"), state)
+        result = mph.design.optimize(recipe, progress_bar("designing"), state)
     except KeyboardInterrupt:
         say(f"{state}: the search so far is kept; the same command resumes it")
         raise
@@ -50,8 +50,7 @@ def _optimize(arguments: argparse.Namespace) -> None:
     record = {"parameters": result.parameters, "objectives": result.values, "faults": result.faults}
     *lines, verdict = result.summary()
     if arguments.evaluate:
-        bar = None if arguments.quiet else progress_bar("evaluating")
-        gain = mph.design.evaluate(recipe, result.start, result.system, bar)
+        gain = mph.design.evaluate(recipe, result.start, result.system, progress_bar("evaluating"))
         record["evaluation"] = gain._asdict()
         lines.append(f"{gain.score}: {gain.start:.4g} at the start, now {gain.found:.4g}; better by {gain.gain:.1%}, "
                      f"95 % interval {gain.low:.1%} to {gain.high:.1%}")  # fmt: skip
@@ -64,7 +63,7 @@ def _pareto(arguments: argparse.Namespace) -> None:
     mphdrr design pareto front.toml -o front.csv front.png
     """
     paths = [output_path(name, (".csv", ".json", ".png", ".svg")) for name in arguments.output]
-    front = mph.design.pareto(arguments.recipe, None if arguments.quiet else progress_bar("designing"))
+    front = mph.design.pareto(arguments.recipe, progress_bar("designing"))
     for path in paths:
         front.write(path)
     lines = ["  ".join(f"{name} {value:.5g}" for name, value in row.items()) for row in front.rows]

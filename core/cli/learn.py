@@ -5,7 +5,6 @@ import argparse
 from .. import learning
 from ..errors import InputError
 from ..learning.networks import NETWORKS
-from ..progress import Progress
 from .options import add_actions, add_run, output_path, print_or_write_recipe, progress_bar, say
 
 
@@ -53,7 +52,7 @@ def _train(arguments: argparse.Namespace) -> None:
     path = output_path(arguments.output, (".pt",))
     recipe = learning.read_recipe(arguments.recipe)
     try:
-        model = learning.train(recipe, path, arguments.workers, lambda words: _progress(words, arguments.quiet))
+        model = learning.train(recipe, path, arguments.workers, progress_bar)
     except KeyboardInterrupt:
         say(f"{path}: samples and the last checkpoint are kept; the same command goes on")
         raise
@@ -69,13 +68,8 @@ def _judge(arguments: argparse.Namespace) -> None:
     recipe = learning.read_judge_recipe(arguments.recipe)
     models = {name: learning.read_model(path) for name, path in recipe.models.items()}
     methods = [model.judged(name) for name, model in models.items()]
-    judgement = learning.judge(recipe, arguments.output, methods, _progress("judging", arguments.quiet))
+    judgement = learning.judge(recipe, arguments.output, methods, progress_bar("judging"))
     for name, model in models.items() if arguments.into_models else ():
         rows = [row for row in judgement.rows if row["method"] == name]
         learning.with_judgement(model.path, {**judgement.record, "rows": rows})
     print(f"{arguments.output}: {len(judgement.rows)} rows in judgement.md, .json and .png")
-
-
-def _progress(title: str, is_quiet: bool) -> Progress | None:
-    """Return a progress bar with a title, None if nothing is to be shown."""
-    return None if is_quiet else progress_bar(title)

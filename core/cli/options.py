@@ -3,17 +3,20 @@
 import argparse
 import inspect
 import json
+import os
 import re
+import signal
 import sys
 import textwrap
+import threading
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..errors import InputError
 from ..files import ensure_folder, note_output, refuse_folder, require_ending, write_bytes
-from ..progress import Progress
 
 if TYPE_CHECKING:  # the parser of all commands reads this file, and numpy takes a while
     from ..volumes.volume import Volume
@@ -35,6 +38,11 @@ COMMANDS = {
 }
 """Module of a command -> its summary in the help; the module is imported only when its options are needed."""
 
+INTERVAL = 60.0
+"""Longest silence, s, of a command whose standard error is no terminal (`reporting`)."""
+_stage: "ProgressBar | None" = None  # that the running command is in
+_is_quiet = False  # whether the running command has --quiet
+_WIDTH = 30  # of progress bars, characters
 _LONG = r"""(?<!\w)'[^']{199,}'|(?<!\w)"[^"]{199,}"|\[[^]]{199,}\]|\S{201,}"""
 _HANGING = 15 * " "  # indent of further lines in the second column of lists in descriptions
 
@@ -192,7 +200,7 @@ def count_text(number: int, noun: str) -> str:
 def say(text: str) -> None:
     """Print a line on standard error; on a terminal it replaces an unfinished progress bar."""
     over = "\r\x1b[K" if sys.stderr.isatty() else ""
-    print(f"{over}mphdrr: {message_line(text)}", file=sys.stderr, flush=True)
+    print(f"{over}mphdrr: {message_line(text)}\n", end="", file=sys.stderr, flush=True)  # whole, beside other threads'
 
 
 def message_line(text: str) -> str:
@@ -206,21 +214,87 @@ def message_line(text: str) -> str:
     return text
 
 
-def progress_bar(label: str, status_text: Callable[[], str] | None = None) -> Progress:
-    """Return a progress callback that draws a bar on standard error if that is a terminal, and prints nothing otherwise.
+def duration_text(seconds: float) -> str:
+    """Return a duration as text, such as "85 min"."""
+    if seconds < 100:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60:.0f} min" if seconds < 6000 else f"{seconds / 3600:.1f} h"
+
+
+class ProgressBar:
+    """Progress callback of a stage: a bar on a terminal, and elsewhere the state that `reporting` prints now and then."""
+
+    def __init__(self, label: str, status_text: Callable[[], str] | None) -> None:
+        self._label, self._status_text, self._start_time = label, status_text, time.monotonic()
+        self.remark: Callable[[], str] | None = None  # a text on the last step, such as its loss (`tell`)
+        self._first = self._last = (self._start_time, 0, 0)  # time, steps done and steps at the first and last report
+
+    def __call__(self, n_done: int, total: int) -> None:
+        """Note the steps done; on a terminal draw the bar, whose line ends when it is full."""
+        global _stage
+        report = time.monotonic(), n_done, total
+        if total != self._last[2] or n_done < self._last[1]:  # the first report, or that of another round
+            self._first = report
+        self._last, _stage = report, self if n_done < total else None
+        if sys.stderr.isatty() and not _is_quiet:
+            filled = _WIDTH * n_done // max(total, 1)
+            text = self._status_text() if self._status_text else f"{report[0] - self._start_time:.1f} s"
+            bar = f"[{'#' * filled}{'.' * (_WIDTH - filled)}]"
+            end = "" if n_done < total else "\n"
+            print(f"\r{self._label} {bar} {n_done}/{total}  {text}\x1b[K", end=end, file=sys.stderr, flush=True)
+
+    def state(self) -> str:
+        """Return the last state: "training: step 120 of 4000, loss 0.412, 2.1 steps/s, 31 min left"."""
+        (first_time, n_first, _), (time_done, n_done, total) = self._first, self._last
+        idle = time.monotonic() - time_done
+        step = f"step {n_done} of {total}" if total else "no step done"
+        texts = [f"{step} for {duration_text(idle)}" if idle > INTERVAL or not total else step]
+        texts += [self.remark()] if self.remark else []
+        if n_done > n_first:
+            seconds = (time_done - first_time) / (n_done - n_first)  # of a step
+            texts.append(f"{1 / max(seconds, 1e-9):.1f} steps/s" if seconds < 1 else f"{seconds:.1f} s per step")
+            left = duration_text(max(0.0, seconds * (total - n_done) - idle))
+            texts.append(self._status_text() if self._status_text else f"{left} left")
+        return f"{self._label}: {', '.join(texts)}"
+
+
+def progress_bar(label: str, status_text: Callable[[], str] | None = None) -> ProgressBar:
+    """Return a new stage's progress callback, which `reporting` names from now on.
 
     Behind the bar stand the elapsed seconds, or the text that `status_text` returns.
     """
-    start_time, width = time.monotonic(), 30
+    global _stage
+    _stage = ProgressBar(label, status_text)
+    return _stage
 
-    def show(n_done: int, total: int) -> None:
-        """Draw the bar; a finished one ends its line."""
-        if not sys.stderr.isatty():
-            return
-        filled = width * n_done // max(total, 1)
-        text = f"{time.monotonic() - start_time:.1f} s" if status_text is None else status_text()
-        end = "\n" if n_done >= total else ""
-        bar = f"[{'#' * filled}{'.' * (width - filled)}]"
-        print(f"\r{label} {bar} {n_done}/{total}  {text}\x1b[K", end=end, file=sys.stderr, flush=True)
 
-    return show
+@contextmanager
+def reporting(is_quiet: bool = False) -> Iterator[None]:
+    """Print, within the block of a command, a line on its stage each `INTERVAL`, if standard error is no terminal.
+
+    A thread does it, so that a step of hours is heard, too. A command that `is_quiet` has neither lines nor bars, and of the
+    processes of a training on one machine only the first has.
+    """
+    global _stage, _is_quiet
+    _stage, start_time, end = None, time.monotonic(), threading.Event()
+    _is_quiet = is_quiet or os.environ.get("LOCAL_RANK", "0") != "0"  # set by Lightning and torchrun
+
+    def report() -> None:
+        """Print the lines until the block ends."""
+        if hasattr(signal, "pthread_sigmask"):  # signals are for the main thread, which may hold them back
+            signal.pthread_sigmask(signal.SIG_BLOCK, signal.valid_signals())
+        while not end.wait(INTERVAL):
+            stage, elapsed = _stage, duration_text(time.monotonic() - start_time)
+            with suppress(OSError, ValueError):  # standard error was closed
+                say(f"at work for {elapsed}" if stage is None else stage.state())
+
+    thread = threading.Thread(target=report, name="reporting", daemon=True)
+    if not _is_quiet and not sys.stderr.isatty():
+        thread.start()
+    try:
+        yield
+    finally:
+        end.set()
+        _is_quiet = False
+        if thread.ident is not None:
+            thread.join()

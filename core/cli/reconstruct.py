@@ -40,7 +40,7 @@ def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
     parser.add_argument("-o", "--output", metavar="FILE", help=f"the volume: {', '.join(VOLUME_FORMATS)}")
     text = f"also draw slices and the objective ({', '.join(SUFFIXES)}), for a simulated run beside the truth"
     parser.add_argument("--picture", metavar="FILE", help=text)
-    parser.add_argument("--quiet", action="store_true", help="no line for each iteration on standard error")
+    parser.add_argument("--quiet", action="store_true", help="no bars and no lines of iterations on standard error")
     text = "write the recipe (.toml) of these options instead of reconstructing"
     parser.add_argument("--write-recipe", metavar="FILE", help=text)
 
@@ -137,9 +137,10 @@ class _IterationLog:
         self.start_time, self.interrupted = time.monotonic(), False
 
     def stage(self, title: str) -> mph.Progress | None:
-        """Return the progress callback of a stage: a bar, or for the iterations the check for an interruption."""
+        """Return the progress callback of a stage: a bar, but on a terminal none of the iterations, which have lines."""
+        self.bar = progress_bar(title)
         if title != "reconstructing":
-            return progress_bar(title)
+            return self.bar
         self.start_time = time.monotonic()
         return self._check
 
@@ -147,13 +148,16 @@ class _IterationLog:
         """Note that Ctrl-C was typed, which stops the reconstruction after the current update."""
         self.interrupted = True
 
-    def _check(self, _n_done: int, total: int) -> None:
-        """Raise `Cancelled` if Ctrl-C was typed."""
+    def _check(self, n_done: int, total: int) -> None:
+        """Report the progress; raise `Cancelled` if Ctrl-C was typed."""
         if self.interrupted:
             raise mph.Cancelled
+        if not sys.stderr.isatty():
+            self.bar(n_done, total)
 
     def __call__(self, iteration: int, values: Any, objective: Sequence[float]) -> None:
         """Print the objective and the largest value after an iteration."""
+        self.bar.remark = lambda: f"{self.objective_name} {objective[-1]:.8g}"
         if not self.quiet:
             seconds = time.monotonic() - self.start_time
             line = f"{self.objective_name} {objective[-1]:.8g}, largest {float(values.max()):.4g}, {seconds:.1f} s"

@@ -33,7 +33,7 @@ from torch.utils.data import DataLoader
 
 from ..errors import InputError, first_line, naming, refusing, warn
 from ..files import AnyPath, ensure_folder, locked, read_bytes, remove_leftovers, require_ending, write_bytes
-from ..progress import Progress, Stages
+from ..progress import Progress, Stages, tell
 from .data import Samples, Source, prepare_samples
 from .judging.sets import events_by_recipe, set_fingerprint, truths_of
 from .model_file import ModelContents, TrainedNetwork, read_model, write_model
@@ -228,10 +228,10 @@ class _ProgressReport(Callback):
     def __init__(self, folder: Path, steps: int, progress: Progress | None) -> None:
         self.folder, self.steps, self.progress = folder, steps, progress
 
-    def on_train_batch_end(self, trainer: pl.Trainer, *_: Any) -> None:
+    def on_train_batch_end(self, trainer: pl.Trainer, _module: Any, outputs: Any, *_: Any) -> None:
         """Report a step."""
-        if self.progress is not None and trainer.is_global_zero:
-            self.progress(trainer.global_step, self.steps)
+        if trainer.is_global_zero:
+            tell(self.progress, trainer.global_step, self.steps, lambda: f"loss {outputs['loss']:.3g}")
 
     def on_save_checkpoint(self, trainer: pl.Trainer, pl_module: Any, checkpoint: dict[str, Any]) -> None:
         """Write the learning curve after a round."""

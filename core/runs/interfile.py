@@ -14,8 +14,8 @@ import numpy as np
 
 from ..arrays import Floats
 from ..errors import InputError
-from ..files import require_file
 from ..validation import whole_in_file
+from ..volumes.formats.contents import find_data_file
 from .frame_facts import FileFrames, file_numbers, rescaled
 from .stated_times import DAY, moment, stated_duration, stated_number
 
@@ -78,7 +78,7 @@ class _Header:
             key = " ".join(key.strip().lstrip("!").lower().replace("[", " [").split())
             if assigned and not line.lstrip().startswith(";"):
                 self.values.setdefault(key, []).append(value.strip())
-        self.data_path = _data_file(path, self.text("name of data file"))
+        self.data_path = find_data_file(path, "name of data file", self.text("name of data file"))
         self.data_size = max(1, self.data_path.stat().st_size)
 
     def all(self, key: str) -> list[str]:
@@ -209,11 +209,3 @@ def _starts(header: _Header, times: list[float], sizes: list[int]) -> list[float
     else:
         return [] if math.isnan(begin) else [begin]
     return [start + (0.0 if math.isnan(begin) else begin) for start in starts]
-
-
-def _data_file(path: Path, name: str) -> Path:
-    """Return the file of numbers: at the header's path, or beside the header, since both may have been moved together."""
-    for candidate in (path.parent / name, path.parent / Path(name.replace("\\", "/")).name):
-        if name and candidate.exists():
-            return require_file(candidate)
-    raise InputError(f"its numbers are in {name or 'no file that it names'}, which is not beside it")

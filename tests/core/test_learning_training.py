@@ -265,7 +265,7 @@ def start_training(folder: Path, *changes: str) -> subprocess.Popen:
     """Start a training of the toy, with one text of its recipe changed, as a program that Lightning can start again."""
     (folder / "command.py").write_text(SCRIPT, encoding="utf-8")
     (folder / "changed.toml").write_text(TRAINING.replace(*changes), encoding="utf-8")
-    words = ["command.py", "learn", "train", str(folder / "changed.toml"), "-o", str(folder / "m.pt")]
+    words = ["command.py", "learn", "train", str(folder / "changed.toml"), "-o", str(folder / "m.pt"), "--quiet"]
     environment = {**os.environ, "PYTHONPATH": str(Path(mphdrr.__path__[0]).parent)}
     return subprocess.Popen([sys.executable, *words], cwd=folder, env=environment, stderr=subprocess.PIPE, text=True)
 

@@ -298,7 +298,7 @@ def test_files_that_hold_no_frames_are_refused_in_one_line(tmp_path):
         ("two.npz", {"dataset": "c"}, "no dataset 'c' in it; there are: a, b"),
         ("cut.hdr", {}, "expected 48 bytes .*, cut.sin has 5"),
         ("cut.sin", {}, "expected its header cut.hdr, which is beside it"),
-        ("alone.hdr", {}, "which is not beside it"),
+        ("alone.hdr", {}, "the header's folder, which lacks them"),
         ("analyze.hdr", {}, "not an Interfile header"),
     ):  # fmt: skip
         paths = [tmp_path / name for name in names.split()] or tmp_path

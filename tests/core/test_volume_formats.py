@@ -528,7 +528,7 @@ BAD = {
     "MetaImage too long": (_meta(DimSize="5 6 6"), "360 bytes of voxels (DimSize x ElementType), it holds more"),
     "MetaImage of colours": (_meta(ElementNumberOfChannels="3"), "expected one value per voxel, found 3"),
     "MetaImage of another type": (_meta(ElementType="MET_OTHER"), "ElementType MET_OTHER: expected one of"),
-    "no voxels of a MetaImage": (_meta(ElementDataFile="gone.raw"), "are in gone.raw, which is not beside it"),
+    "no voxels of a MetaImage": (_meta(ElementDataFile="gone.raw"), "gone.raw: its numbers are read from the header"),
     "MetaImage of text": (_meta(ElementSpacing="1 a 3"), "ElementSpacing = 1 a 3: expected numbers"),
     "2-D MetaImage": (_meta(DimSize="5 6", NDims="2"), "expected a 3-D image, got shape 5 x 6"),
     "MetaImage of nothing": (_bytes("v.mha", b"\x00" * 99), "not a MetaImage file"),

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 from ... import events
 from ...errors import InputError
 from ...memory import readable_size
-from ..options import add_set_action, print_answer, progress_bar, say
+from ..options import add_set_action, duration_text, print_answer, progress_bar, say
 
 if TYPE_CHECKING:
     from ...events.work import Making
@@ -72,14 +72,13 @@ def run_with_reports(work: Making, quiet: bool) -> int:
     for progress in work:
         n_done, size = progress.done, size + progress.size
         ratio = (progress.total - n_done) / n_done  # remaining events per event made
-        remaining = f"{readable_size(size * ratio)}, {_duration_text((time.monotonic() - start_time) * ratio)}"
+        remaining = f"{readable_size(size * ratio)}, {duration_text((time.monotonic() - start_time) * ratio)}"
         if n_done == 1 and not quiet:
             facts = f"{readable_size(size)} in {progress.seconds:.1f} s; {progress.total - 1} more: {remaining}"
             say(f"event {progress.number}: {facts}")
         if n_done in (1, 10, 100, 1000) and size * ratio > _free_bytes(work):
             say(f"warning: only {readable_size(_free_bytes(work))} are free on the disk of {work.folder.path}")
-        if not quiet:
-            bar(n_done, progress.total)
+        bar(n_done, progress.total)
     return n_done
 
 
@@ -107,10 +106,3 @@ def _parse_shard(text: str) -> tuple[int, int]:
         return int(part_text), int(count_text)
     except ValueError:
         raise argparse.ArgumentTypeError(f"expected I/N, such as 1/3, got {text}") from None
-
-
-def _duration_text(seconds: float) -> str:
-    """Return a duration as text, such as "85 min"."""
-    if seconds < 100:
-        return f"{seconds:.0f} s"
-    return f"{seconds / 60:.0f} min" if seconds < 6000 else f"{seconds / 3600:.1f} h"

@@ -12,6 +12,7 @@ import numpy as np
 
 from .... import core as mph
 from ...files import write_bytes
+from ...progress import StagedProgress
 from ...runs.mosaic import write_png
 from ..options import add_run, count_text, output_path, print_answer, progress_bar
 
@@ -36,7 +37,7 @@ def _run(arguments: argparse.Namespace) -> None:
 
     path = output_path(arguments.output, (".xlsx", ".xlsm"))
     record_path, picture_path = (output_path(str(path.with_suffix(suffix))) for suffix in (".json", ".png"))
-    calibration = run_calibration(arguments.recipe, progress_bar("finding spots"))
+    calibration = run_calibration(arguments.recipe, StagedProgress(progress_bar, "calibrating"))
     source = calibration.system.source
     mph.write_system(calibration.system, path, None if source is None else source.path)
     record = _record(calibration)

@@ -5,6 +5,7 @@ axes of DICOM and ITK point to the left, to the back (posterior) and to the head
 """
 
 import math
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,6 +15,7 @@ import numpy as np
 
 from ...arrays import Array, Floats
 from ...errors import InputError, warn
+from ...files import require_file
 from ...geometry.grid import Grid
 from ...memory import require
 from ...validation import freeze
@@ -70,10 +72,20 @@ def require_voxels(shape: Sequence[int], dtype: np.dtype[Any], n_held: float = m
     require((4.5 + dtype.itemsize) * n_voxels, f"a volume of {sizes} voxels")
 
 
-def require_one_data_file(field: str, name: str) -> None:
-    """Raise `InputError` if a header's `field` with the `name` of the voxels' file stands for several files."""
+def find_data_file(path: Path, field: str, name: str) -> Path:
+    """Return the file of numbers whose `name` is in a `field` of the header at `path`.
+
+    It lies in the header's folder or below it. For a name that leads elsewhere, or to nothing, the file of that name beside
+    the header is returned, since both may have been moved together. Raises `InputError` if it is none, or several.
+    """
+    folder = Path(os.path.abspath(path.parent))
+    for text in (name, name.replace("\\", "/").rpartition("/")[2]):
+        named = Path(os.path.abspath(folder / text))
+        if folder in named.parents and (candidate := path.parent / named.relative_to(folder)).exists():
+            return require_file(candidate)
     if name.upper().startswith("LIST") or "%" in name:
         raise InputError(f"{field} {name}: voxels in several files are not read; convert them to one")
+    raise InputError(f"{field} {name or 'missing'}: its numbers are read from the header's folder, which lacks them")
 
 
 def warn_of_assumptions(path: Path, assumptions: Sequence[str]) -> None:

@@ -13,10 +13,9 @@ import numpy as np
 
 from ...arrays import Floats
 from ...errors import InputError, expecting
-from ...files import require_file
 from ...geometry.frames import affine_matrix
 from ...validation import whole_in_file
-from .contents import RAS_FROM_LPS, VolumeFileContents, require_one_data_file, require_voxels, warn_of_assumptions
+from .contents import RAS_FROM_LPS, VolumeFileContents, find_data_file, require_voxels, warn_of_assumptions
 
 _TYPES = {
     "MET_CHAR": "i1", "MET_SHORT": "i2", "MET_INT": "i4", "MET_LONG": "i4", "MET_LONG_LONG": "i8",
@@ -73,16 +72,12 @@ def _read_header(file: BinaryIO) -> dict[str, str]:
 def _read_data(header: dict[str, str], file: BinaryIO, path: Path, size: int) -> bytes:
     """Return the `size` bytes of the voxels, from the open header's `file` or the file that the header names."""
     name = header["ElementDataFile"]
-    require_one_data_file("ElementDataFile", name)
     if not _is_true(header.get("BinaryData", "True")):
         raise InputError("BinaryData = False: voxels written as text are not read")
     if name.upper() == "LOCAL":
         return _decompress(header, file, size, "it")
-    data_path = path.parent / name
-    if not data_path.exists():
-        raise InputError(f"its voxels are in {name}, which is not beside it")
-    with open(require_file(data_path), "rb") as data_file:
-        return _decompress(header, data_file, size, name)
+    with open(find_data_file(path, "ElementDataFile", name), "rb") as voxels_file:
+        return _decompress(header, voxels_file, size, name)
 
 
 def _decompress(header: dict[str, str], file: BinaryIO, size: int, name: str) -> bytes:

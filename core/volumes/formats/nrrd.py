@@ -7,11 +7,10 @@ from typing import Any
 import numpy as np
 
 from ...errors import InputError, first_line
-from ...files import require_file
 from ...geometry.frames import affine_matrix
 from ...validation import whole_in_file
 from ..volume import Volume
-from .contents import VolumeFileContents, require_one_data_file, require_voxels, warn_of_assumptions
+from .contents import VolumeFileContents, find_data_file, require_voxels, warn_of_assumptions
 
 # Signs that convert a space's axes to right, anterior, superior. A space without a name is assumed to have these axes.
 _SPACES: dict[str | None, tuple[int, int, int]] = {
@@ -72,16 +71,16 @@ def read(path: Path) -> VolumeFileContents:
     limits = [header[name] for name in ("old min", "old max") if np.isfinite(float(header.get(name, np.nan)))]
     if limits and value_type not in ("float", "double"):
         raise InputError("old min and old max: quantized values are not read; unquantize them (unu unquantize)")
-    data_file = header.get("data file", "")
-    require_one_data_file("data file:", data_file)
-    data_path = path.parent / data_file if data_file else path
-    if data_path.exists():
-        n_bytes = require_file(data_path).stat().st_size
-        for name in ("line skip", "byte skip"):
-            whole_in_file(header.get(name, 0), name, -(name == "byte skip"), n_bytes)
+    data_path = find_data_file(path, "data file:", header["data file"]) if header.get("data file") else path
+    for name in ("line skip", "byte skip"):
+        whole_in_file(header.get(name, 0), name, -(name == "byte skip"), data_path.stat().st_size)
     affine = _affine(header, path)
     try:
-        array, _ = nrrd.read(str(path))
+        with open(path, "rb") as file:
+            own_header = nrrd.read_header(file)
+            if data_path is not path:
+                own_header["datafile"] = str(data_path.absolute())  # of both spellings pynrrd takes this one
+            array = nrrd.read_data(own_header, file, str(path))
     except Exception as error:  # pynrrd's message says little or nothing about missing data
         sizes = " x ".join(map(str, header["sizes"]))
         raise InputError(f"its data are damaged or end early; expected {sizes} voxels ({first_line(error)})") from error

@@ -127,6 +127,12 @@ def number_ranges(numbers: Sequence[int]) -> list[str]:
     return [f"{first}-{last}" if last > first else str(first) for first, last in ranges]
 
 
+def numbers_text(numbers: Sequence[int]) -> str:
+    """Return whole `numbers`, given in rising order, as text with at most ten ranges, such as "0-7, 12, 30-99"."""
+    texts = number_ranges(numbers)
+    return ", ".join(texts if len(texts) <= 10 else [*texts[:10], f"… ({len(numbers)} in all)"])
+
+
 def several(items: Iterable[object], limit: int = 3) -> str:
     """Return the first `limit` items, joined by commas, and the number of the others: "a, b, c and 2 more"."""
     texts = [str(item) for item in items]

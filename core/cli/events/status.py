@@ -4,7 +4,7 @@ import argparse
 from dataclasses import asdict
 
 from ... import events
-from ...errors import number_ranges
+from ...errors import numbers_text
 from ...memory import readable_size
 from ..options import add_set_action, count_text, print_answer
 
@@ -32,9 +32,3 @@ def _run(arguments: argparse.Namespace) -> None:
     if status.missing:
         lines.append(f"missing: {numbers_text(status.missing)}; mphdrr events make {arguments.folder} makes them")
     print_answer(arguments, asdict(status), lines)
-
-
-def numbers_text(numbers: list[int]) -> str:
-    """Return ascending whole numbers as text, such as "0-7, 12, 30-99"."""
-    texts = number_ranges(numbers)
-    return ", ".join(texts if len(texts) <= 10 else [*texts[:10], f"… ({len(numbers)} in all)"])

@@ -6,6 +6,7 @@ They are computed once, into a folder whose name is a hash of everything they de
 import hashlib
 import io
 import json
+import math
 import shutil
 from collections.abc import Sequence
 from dataclasses import replace
@@ -21,17 +22,20 @@ from ..errors import InputError, naming, warn
 from ..events.event_set import COUNTED, Event, EventSet
 from ..events.noise_choice import mixed_seed
 from ..files import ensure_folder, remove_leftovers, write_bytes
-from ..memory import readable_size
+from ..memory import readable_size, require
 from ..progress import Progress, tell
 from ..runs.reconstructing import inverse_crime_notes, reconstruction_model
 from ..runs.run import ProjectionRun
 from ..runs.run_recipe import projector_of_run
+from ..validation import shape_text
 from ..volumes.resampling import resample
 from .recipe import TrainingRecipe
 from .setup import Sample, ScannerSetup
 
 _VERSION = 1
 """Version of the contents of sample files."""
+_MAX_SAMPLES = 10**7
+"""Largest number of samples of a split."""
 _LARGE = 2**32
 """Disk space, bytes, from which on a warning is given."""
 
@@ -101,6 +105,7 @@ class Source:
         """Data type of a sample's file: the fields of `Sample` without the batch axis."""
         (m, n_v, n_u), grid = self.setup.A.shape_out, self.recipe.grid.shape
         shapes = ((m, n_v, n_u), (m, n_v, n_u), (len(self.setup.after), *grid), (), grid)
+        require(4 * sum(map(math.prod, shapes)), f"a sample of {shape_text(grid)} voxels")
         return np.dtype([(name, "<f4", shape) for name, shape in zip(Sample._fields, shapes, strict=True)])
 
     @cached_property
@@ -119,6 +124,8 @@ class Source:
         with naming("data"):
             if not (numbers := self.events.split(split).numbers):
                 raise InputError(f"the split {split!r} of {self.recipe.path('data.events')} holds no events")
+            if (count := len(numbers) * n_draws) > _MAX_SAMPLES:
+                raise InputError(f"draws: at most {_MAX_SAMPLES:,} samples of a split, got {count:,}")
         return [(number, draw) for number in numbers for draw in range(n_draws)]
 
     def sample(self, draw: Draw) -> Sample:

@@ -75,7 +75,7 @@ def tables(values: dict[str, Any]) -> list[tuple[Any, ...]]:
 
 
 def mutations(values: dict[str, Any], text: str, count: int, seed: int) -> Iterator[Mutation]:
-    """Yield `count` mutations of a recipe with these values; `text` is its file, whose comments and lines are damaged."""
+    """Yield a recipe as it is, and `count` mutations of it, of its `values` or of the `text` of its file."""
     rng = np.random.default_rng(seed)
 
     def any_of(items: Any) -> Any:
@@ -86,7 +86,9 @@ def mutations(values: dict[str, Any], text: str, count: int, seed: int) -> Itera
         path = any_of(list(places(changed)))
         table, old = at(changed, path[:-1]), at(changed, path)
         table[path[-1]] = new = other(old)
-        return Mutation(document(changed), f"{name}: {'.'.join(map(str, path))} = {as_toml(new)[:60]!r}, was {old!r:.60}")
+        return Mutation(
+            document(changed), f"{name}: {'.'.join(map(str, path))} = {as_toml(new)[:60]!r}, was {old!r:.60}"
+        )
 
     def removed() -> Mutation:
         changed = deepcopy(values)
@@ -109,7 +111,9 @@ def mutations(values: dict[str, Any], text: str, count: int, seed: int) -> Itera
 
     def swapped() -> Mutation:
         changed = deepcopy(values)
-        one, other = (any_of([path for path in places(changed) if not isinstance(at(changed, path), dict)]) for _ in "ab")
+        one, other = (
+            any_of([path for path in places(changed) if not isinstance(at(changed, path), dict)]) for _ in "ab"
+        )
         a, b = at(changed, one), at(changed, other)
         if one[: len(other)] != other and other[: len(one)] != one:
             at(changed, one[:-1])[one[-1]], at(changed, other[:-1])[other[-1]] = b, a
@@ -156,5 +160,6 @@ def mutations(values: dict[str, Any], text: str, count: int, seed: int) -> Itera
         lambda: entry(lambda old: old * any_of((1000, 10**6)) if isinstance(old, int | float) else old, "larger"),
         removed, removed, unknown, renamed, swapped, moved, doubled, cut, deep, flipped, flipped,
     )  # fmt: skip
+    yield Mutation(document(values), "nothing")
     for n in range(count):
         yield ways[n % len(ways)]()

@@ -21,7 +21,7 @@ from mphdrr.core.errors import Cancelled
 from mphdrr.core.files import final_name
 from mphdrr.core.recipes.toml import parse_toml
 
-from .mutated_recipes import KEY, mutations
+from .mutated_recipes import mutations
 from .small_design import BODY, PARTS
 from .small_design import TEXT as DESIGN
 from .small_recipes import JUDGE, TRAINING
@@ -173,10 +173,18 @@ def stop_design(patch: pytest.MonkeyPatch) -> None:
 
 
 def stop_calibration(patch: pytest.MonkeyPatch) -> None:
-    """Let a calibration look for spots once, and fit twice."""
+    """Let a calibration keep the first spots that it finds in the images of all modules, and fit twice."""
     from mphdrr.core.design import calibration
 
-    patch.setattr(calibration, "_SPOT_ROUNDS", 1)
+    find, kept = calibration._find_spots, {}
+
+    def found(images: Any, model: Any, spots: Any, points: Any, stages: Any) -> Any:
+        if images.shape not in kept:
+            kept[images.shape] = find(images, model, spots, points, stages)
+        spots, start = kept[images.shape]
+        return spots, start if points is None else points
+
+    patch.setattr(calibration, "_find_spots", found)
     patch.setattr(calibration, "_ROUNDS", 2)
 
 

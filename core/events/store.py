@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from ..errors import InputError, refusing
-from ..files import locked, refuse_links, write_bytes
+from ..files import ensure_folder, locked, refuse_links, write_bytes
 from ..progress import Progress, tell
 from .event_files import FileLocation, verify
 
@@ -75,8 +75,7 @@ class Store:
         packing, an event is damaged, or a shard cannot be written; each event then is intact in its own file or in a shard.
         """
         refuse_links(self.events, self.shards)
-        with refusing(self.shards, "cannot be made"):
-            self.shards.mkdir(exist_ok=True)
+        ensure_folder(self.shards)
         with locked(self.shards / LOCK, f"{self.shards}: another process is packing this set; wait until it ends"):
             copies, shards = self.copies(), self.shard_paths()
             numbers = [number for number, found in copies.items() if not _first_intact(number, found).offset]
@@ -213,7 +212,4 @@ def _padded(size: int) -> int:
 def _file_names(folder: Path) -> list[str]:
     """Return the names of the files in a folder; none where there is no folder."""
     with refusing(folder, "cannot be read"):
-        try:
-            return os.listdir(folder)
-        except FileNotFoundError:
-            return []
+        return os.listdir(folder) if folder.exists() else []

@@ -65,7 +65,7 @@ class ExportPlan:
         for name in {str(Path(file).parent) for part in self.missing for file in part.files}:
             if name != ".":
                 refuse_links(self.folder / name)
-            ensure_folder(self.folder / name)
+                ensure_folder(self.folder / name)
         self._remove_leftovers()
         for path in self.changed:
             path.unlink(missing_ok=True)

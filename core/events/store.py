@@ -60,8 +60,16 @@ class Store:
         return dict(sorted(copies.items()))
 
     def locations(self) -> dict[int, FileLocation]:
-        """Return the location of each event by number, in order; of several `copies`, the first intact one."""
-        return {number: _first_intact(number, copies) for number, copies in self.copies().items()}
+        """Return the location of each event by number, in order; of several `copies`, the first intact one.
+
+        If none is intact, it is the first one. An event's only copy is not read.
+        """
+        return {
+            number: copies[0]
+            if len(copies) == 1
+            else next((copy for copy in copies if _is_intact(number, copy)), copies[0])
+            for number, copies in self.copies().items()
+        }
 
     def shard_paths(self) -> list[Path]:
         """Return the paths of the shards, in order."""
@@ -78,7 +86,7 @@ class Store:
         ensure_folder(self.shards)
         with locked(self.shards / LOCK, f"{self.shards}: another process is packing this set; wait until it ends"):
             copies, shards = self.copies(), self.shard_paths()
-            numbers = [number for number, found in copies.items() if not _first_intact(number, found).offset]
+            numbers = [number for number, location in self.locations().items() if not location.offset]
             last, n_packed = int(shards[-1].stem) if shards else 0, 0
             while n_packed < len(numbers):
                 n_packed += self._append(self.shards / f"{last:06d}.tar", numbers[n_packed:], copies, shard_bytes)
@@ -163,13 +171,6 @@ def _is_intact(number: int, location: FileLocation) -> bool:
         return verify(location).event == number
     except InputError:
         return False
-
-
-def _first_intact(number: int, copies: Sequence[FileLocation]) -> FileLocation:
-    """Return the first intact copy of an event, the first one if none is; an only copy is not read."""
-    if len(copies) == 1:
-        return copies[0]
-    return next((copy for copy in copies if _is_intact(number, copy)), copies[0])
 
 
 def _members(shard: Path) -> Iterator[tuple[int, FileLocation]]:

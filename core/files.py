@@ -198,7 +198,8 @@ def is_leftover(path: Path) -> bool:
 def remove_leftovers(folder: Path, names: str = ".*") -> None:
     """Remove the temporary files in `folder`, those whose `names` fit, that nobody writes any more (`is_leftover`)."""
     for path in filter(is_leftover, folder.glob(names)):
-        path.unlink(missing_ok=True)
+        if path.is_symlink() or not path.is_dir():
+            path.unlink(missing_ok=True)
 
 
 def require_file(path: AnyPath, expected: str = "a file", is_input: bool = True) -> Path:
@@ -282,6 +283,14 @@ def _is_folder(path: Path) -> bool:
         raise InputError(f"{str(path)!r}: not a file name (it holds a NUL)")
     with refusing(repr(str(path)), "not a file name"):  # such as a name that is too long
         return path.is_dir()
+
+
+def refuse_links(*paths: Path) -> None:
+    """Raise `InputError` if one of `paths` is a link: files beyond it may belong to others and are not changed."""
+    for path in paths:
+        if Path(os.path.realpath(path)) != Path(os.path.realpath(path.parent)) / path.name:  # Windows' junctions, too
+            advice = "put the folder or file itself in its place, or link the folder that holds it"
+            raise InputError(f"{path}: is a link: files beyond it are read, but not changed; {advice}")
 
 
 def folder_path(path: AnyPath) -> Path:

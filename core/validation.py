@@ -115,7 +115,7 @@ def instance(value: object, kind: type, name: str) -> None:
 
 def one_of(value: object, choices: Collection[object], name: str) -> None:
     """Raise `InputError` unless `value` is one of the `choices`."""
-    if value not in choices:
+    if value not in tuple(choices):  # a list, say, cannot be looked up in a table
         raise InputError(f"{name} {value!r}: expected one of {', '.join(map(str, choices))}")
 
 

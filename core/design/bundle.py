@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..arrays import Bools, Floats, Indexes
+from ..errors import InputError
 from ..geometry.frames import cross_matrix, module_frames, rotations
 from ..geometry.system import PinholeSystem
 from .solvers import scipy_module
@@ -158,6 +159,10 @@ class BundleAdjustment:
 
     def solve(self, x: Floats, robust: bool = False) -> Floats:
         """Return the x of the least sum of squared residuals, from a start x; `robust`: of a sum insensitive to outliers."""
+        if not np.isfinite(self.residuals(x)).all():
+            raise InputError(
+                "calibrate: points, distances or standard deviations are too large or too small to compute with"
+            )
         bounds = np.full(len(x), np.inf)
         self.module_parameters(bounds)[:] = MAX_DEVIATION
         lsmr = {"atol": 1e-8, "btol": 1e-8, "maxiter": 3000, "regularize": False}

@@ -144,8 +144,9 @@ def free_parameters(kind: str, fixed: Mapping[str, Any], free: Mapping[str, Any]
         ends = np.cumsum([start.size for start in starts.values()])
         pieces = zip(starts.items(), np.split(values, ends[:-1]), strict=True)
         arguments = {**fixed, **{name: piece.reshape(start.shape) for (name, start), piece in pieces}}
-        arguments |= {name: np.radians(arguments[name]) for name in _DEGREES if name in arguments}
         with naming("generator"):
+            angles = {name: real_array(arguments[name], name, None) for name in _DEGREES if name in arguments}
+            arguments |= {name: np.radians(angle) for name, angle in angles.items()}
             try:
                 return GENERATORS[kind](**arguments)
             except TypeError as error:  # an argument is missing: Python names it

@@ -20,6 +20,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..arrays import ArrayLike, Floats
+from ..errors import InputError
 from ..geometry.views import Views
 from ..models.emission import Emission
 from ..models.model import with_image_axes
@@ -28,6 +29,7 @@ from ..physics.performance import sensitivity
 from ..validation import at_least_0, instance, one_for_all, real_array
 from .solvers import scipy_module
 
+_MAX_DIAMETER = 1000.0  # of a source, mm
 _NODE_DISTANCE = 1.2  # largest distance of neighbouring chords, in standard deviations of the blur
 _MIN_NODES, _MAX_NODES = 8, 256
 _DEPTHS, _MAX_OPTICAL_DEPTH = 8, 10.0  # of the quadrature over the depth of interaction
@@ -80,7 +82,8 @@ class SpotModel:
     def from_model(cls, model: Emission, views: Views, source_diameter: float = 0.0) -> "SpotModel":
         """Return the model of spots of balls with this diameter, mm; 0 mm is a point."""
         n, system = len(views), model.system
-        variance = at_least_0(source_diameter, "source_diameter", "mm") ** 2 / 20
+        if (diameter := at_least_0(source_diameter, "source_diameter", "mm")) > _MAX_DIAMETER:
+            raise InputError(f"source_diameter: expected at most {_MAX_DIAMETER:g} mm, got {diameter:g}")
         hole, reach = system.pinhole_diameter / 2, np.zeros(n)
         if model.edge == "path":  # transmission exp(-x / reach) at x beyond the rim
             reach = one_for_all(model.optics.tangent / 2 / model.aperture_mu, "edge", n)  # type: ignore[operator]
@@ -88,7 +91,7 @@ class SpotModel:
         radius = hole + reach if model.edge == "path" else model.effective_diameter / 2
         edge_variance = np.maximum(second / (hole**2 + 2 * reach * (hole + reach)) - (hole + reach) ** 2 / 4, 0.0)
         depth = system.detector_thickness * (model.depth_layers > 1)
-        return cls(PixelLattice.from_views(model, views), system.collimator_length, radius, edge_variance, variance,
+        return cls(PixelLattice.from_views(model, views), system.collimator_length, radius, edge_variance, diameter**2 / 20,
                    one_for_all(0.0 if model.optics.crystal_mu is None else model.optics.crystal_mu, "crystal_mu", n),
                    depth)  # fmt: skip
 

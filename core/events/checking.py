@@ -100,22 +100,26 @@ def check(folder: AnyPath, progress: Progress | None = None) -> list[Fault]:
     if faults:  # without the input files, the fingerprint of the recipe is unknown
         return faults
     faults += index_faults(folder)
-    requested, locations = set(_expected_numbers(target)), target.store.locations()
+    requested, copies, locations = set(_expected_numbers(target)), target.store.copies(), target.store.locations()
     fingerprint = target.recipe.fingerprint
 
-    def find_fault(number: int) -> Fault | None:
-        """Return the fault of an event; "foreign" for a faulty file of an event that nobody requested."""
-        location = locations.get(number, FileLocation(str(target.store.event_path(number))))
-        if (fault := _event_fault(location, number, fingerprint)) is None or number in requested:
-            return fault
-        return Fault("foreign", fault.path, f"{fault.text}, and not in the index")
+    def find_fault(number: int, location: FileLocation) -> Fault | None:
+        """Return the fault of an event's copy; "foreign" for a faulty file of an event that nobody requested."""
+        if (fault := _event_fault(location, number, fingerprint)) is None:
+            return None
+        if number not in requested:
+            return Fault("foreign", fault.path, f"{fault.text}, and not in the index")
+        if location != locations.get(number, location):
+            return Fault(fault.kind, fault.path, f"{fault.text} (event {number} is stored twice)")
+        return fault
 
-    numbers = sorted({*requested, *locations})
+    none = {number: [FileLocation(str(target.store.event_path(number)))] for number in requested.difference(copies)}
+    files = [(number, location) for number, found in sorted((none | copies).items()) for location in found]
     with ThreadPoolExecutor(cores()) as pool:
-        for n_checked, fault in enumerate(pool.map(find_fault, numbers), 1):
+        for n_checked, fault in enumerate(pool.map(find_fault, *zip(*files, strict=True)), 1):
             if fault is not None:
                 faults.append(fault)
-            tell(progress, n_checked, len(numbers))
+            tell(progress, n_checked, len(files))
     return [*faults, *_foreign_files(target)]
 
 
@@ -131,18 +135,18 @@ def repair(folder: AnyPath, faults: list[Fault]) -> list[int]:
         A copy of an input file is damaged, which only the original can replace; or a file cannot be moved.
     """
     target = SetFolder(folder)
+    target.refuse_links()
     for fault in faults:
         if fault.kind == "input":
             raise InputError(f"{fault.text}; put the original back, or make a new set")
     requested = _expected_numbers(target)
-    shards = {fault.path for fault in faults if fault.path.parent == target.store.shards and fault.event is not None}
-    if shards:
-        target.store.unpack(shards=shards)  # which keeps their intact events
+    shards = {fault.path for fault in faults}.intersection(target.store.shard_paths())
     for fault in faults:
-        if fault.kind == "foreign":
+        if fault.kind == "foreign" and fault.path not in shards:
             _move_aside(fault.path, target)
         elif fault.kind in ("damaged", "another recipe", "leftover") and fault.path not in shards:
             _remove(fault.path, target)
+    target.store.unpack(shards=shards)  # which keeps their intact events
     if any(fault.kind == "index" for fault in faults):
         target.index.complete(target.store.locations, requested, redraw=True)
     return sorted({fault.event for fault in faults if fault.event is not None})
@@ -223,7 +227,7 @@ def _foreign_files(target: SetFolder) -> Iterator[Fault]:
         (target.path, {RECIPE, INDEX, INPUTS, REQUESTS, EVENTS, SHARDS}),
         (target.inputs, inputs),
         (target.requests_path, target.request_names),  # ranges of simultaneous processes may overlap
-        (store.events, {store.event_path(number).name for number in store.single_events()}),
+        (store.events, {store.event_path(number).name for number in store.copies()}),
         (store.shards, {LOCK, *(path.name for path in store.shard_paths())}),
     ):
         for name in sorted(os.listdir(folder)) if folder.is_dir() else ():
@@ -249,7 +253,7 @@ def _move_aside(path: Path, target: SetFolder) -> None:
     """Move a file that does not belong to a set to the folder ``SET-foreign`` beside the set."""
     foreign_folder = ensure_folder(target.path.with_name(f"{target.path.name}-foreign"))
     destination, number = foreign_folder / path.name, 1
-    while destination.exists():
+    while os.path.lexists(destination):
         number += 1
         destination = foreign_folder / f"{path.stem}-{number}{path.suffix}"
     with refusing(path, f"cannot be moved to {destination}"):

@@ -13,7 +13,7 @@ import numpy as np
 
 from .. import hdf5
 from ..arrays import Floats, Floats32
-from ..errors import InputError
+from ..errors import InputError, number_ranges, several, warn
 from ..files import AnyPath
 from ..geometry.scanner import Scanner
 from ..geometry.views import Views
@@ -307,6 +307,11 @@ class EventSet:
     InputError
         The folder is no event set.
 
+    Warns
+    -----
+    InputWarning
+        Requested events are missing: they are not made yet, or files or members of shards were lost.
+
     Examples
     --------
     >>> events = mph.events.EventSet("set")
@@ -319,7 +324,11 @@ class EventSet:
     def __init__(self, folder: AnyPath) -> None:
         set_folder = SetFolder(folder)
         _ = set_folder.recipe  # raises InputError where the folder is no set
+        requested = set_folder.requested_numbers()
         self._events = [Event(set_folder, number) for number in set_folder.locations]
+        if missing := [number for number in requested if number not in set_folder.locations]:
+            count = f"{len(missing)} of {len(requested)} events are missing: {several(number_ranges(missing), 10)}"
+            warn(f"{set_folder.path}: {count}; mphdrr events make {set_folder.path} makes them", 2)
 
     @classmethod
     def _from_events(cls, events: list[Event]) -> EventSet:

@@ -5,10 +5,11 @@ import os
 import re
 from collections.abc import Sequence
 from functools import cached_property
+from pathlib import Path
 from typing import Any
 
 from ..errors import InputError, warn
-from ..files import AnyPath, ensure_folder, folder_path, remove_leftovers, write_bytes
+from ..files import AnyPath, ensure_folder, folder_path, refuse_links, remove_leftovers, write_bytes
 from ..version import build
 from .event_files import FileLocation, Header, read_header
 from .event_maker import EventMaker
@@ -83,13 +84,17 @@ class SetFolder:
         try:
             entries = json.loads(path.read_text(encoding="utf-8"))
             return {
-                name: Input(self.inputs / entry["file"], entry["what"], entry["sha256"], True)
+                name: Input(self.inputs / Path(entry["file"]).name, entry["what"], entry["sha256"], True)
                 for name, entry in entries.items()
             }
         except FileNotFoundError:
             return {}
         except (OSError, ValueError, TypeError, KeyError) as error:
             raise InputError(f"{path}: cannot be read ({error})") from None
+
+    def refuse_links(self) -> None:
+        """Raise `InputError` if the index or one of the folders is a link: work on the set would change files beyond it."""
+        refuse_links(self.path / INDEX, self.inputs, self.requests_path, self.store.events, self.store.shards)
 
     def prepare(self, recipe: EventRecipe, requested: Sequence[range], numbers: Sequence[int]) -> list[int]:
         """Prepare the folder for a recipe's events: store the recipe, copies of its files, and the requested events.
@@ -98,6 +103,7 @@ class SetFolder:
         another recipe, or files that are no event set.
         """
         ensure_folder(self.path)
+        self.refuse_links()
         for folder in (self.path, self.inputs, self.store.events):
             remove_leftovers(folder)
         if not self.recipe_path.exists():

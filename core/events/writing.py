@@ -4,7 +4,7 @@ import os
 import time
 from typing import Any, NamedTuple
 
-from ..files import AnyPath, write_bytes
+from ..files import AnyPath
 from ..progress import Progress
 from ..recording import recorded_warnings
 from .event_files import FileLocation, pack
@@ -40,7 +40,7 @@ class EventWriter:
             with recorded_warnings() as other_warnings:
                 event = self.maker.make(number, progress)
             data = pack(event, folder.recipe, self._geometry_arrays(), self.maker.threads)
-            write_bytes(location.path, data)
+            folder.store.write_event(number, data)
             warnings, size = [*event.warnings, *other_warnings], len(data)
         if number not in self._indexed:
             folder.index.add(number)

@@ -20,11 +20,12 @@ from ..errors import InputError, naming, several, warn
 from ..events.event_set import COUNTED, Event, EventSet
 from ..events.noise_choice import mixed_seed
 from ..files import ensure_folder, remove_leftovers
-from ..memory import readable_size
+from ..memory import readable_size, require
 from ..progress import Progress, tell
 from ..runs.reconstructing import inverse_crime_notes, reconstruction_model
 from ..runs.run import ProjectionRun
 from ..runs.run_recipe import projector_of_run
+from ..validation import shape_text
 from ..volumes.resampling import resample
 from .recipe import TrainingRecipe
 from .seals import Damaged, read_sealed, write_sealed
@@ -32,6 +33,8 @@ from .setup import Sample, ScannerSetup
 
 _VERSION = 2
 """Version of the contents of sample files."""
+_MAX_SAMPLES = 10**7
+"""Largest number of samples of a split."""
 _LARGE = 2**32
 """Disk space, bytes, from which on a warning is given."""
 
@@ -113,7 +116,9 @@ class Source:
     def size(self) -> int:
         """Size of a sample's arrays, bytes."""
         n_volumes, A = len(self.setup.after) + 1, self.setup.A
-        return 4 * (2 * math.prod(A.shape_out) + n_volumes * math.prod(A.shape_in))
+        size = 4 * (2 * math.prod(A.shape_out) + n_volumes * math.prod(A.shape_in))
+        require(size, f"a sample of {shape_text(self.recipe.grid.shape)} voxels")
+        return size
 
     @cached_property
     def fingerprint(self) -> str:
@@ -131,6 +136,8 @@ class Source:
         with naming("data"):
             if not (numbers := self.events.split(split).numbers):
                 raise InputError(f"the split {split!r} of {self.recipe.path('data.events')} holds no events")
+            if (count := len(numbers) * n_draws) > _MAX_SAMPLES:
+                raise InputError(f"draws: at most {_MAX_SAMPLES:,} samples of a split, got {count:,}")
         return [(number, draw) for number in numbers for draw in range(n_draws)]
 
     def sample(self, draw: Draw) -> Sample:

@@ -17,14 +17,14 @@ from mphdrr.core.design.recipe import TEMPLATE as DESIGN
 from mphdrr.core.design.recipe import read_design_recipe
 from mphdrr.core.events.templates import TEMPLATES, template_text
 from mphdrr.core.learning.recipe import template_text as training_text
-from mphdrr.core.recipes.toml import parse_toml, toml_value
+from mphdrr.core.recipes.toml import parse_toml
 from mphdrr.core.runs.recipe import Recipe, read_recipe, write_recipe
 
 from .conftest import FEWER_MODULES as WORKBOOK
 from .conftest import refused
+from .mutated_recipes import KEY, at, document, tables
 from .small_design import TEXT as SMALL_DESIGN
 
-KEY = "no_such_entry"
 JUDGE = """
 version = 1
 [grid]
@@ -88,33 +88,14 @@ def recipes(folder: Path) -> Iterator[tuple[str, str, Callable[[Path], Any]]]:
     yield "phantom", SHAPES, mph.read_phantom
 
 
-def tables_of(table: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
-    """Yield the paths of all tables below a table, and its own; those that draw a value (`from`, `one_of`) too."""
-    if isinstance(table, dict):
-        yield path
-    items = table.items() if isinstance(table, dict) else enumerate(table) if isinstance(table, list) else ()
-    for key, value in items:
-        yield from tables_of(value, (*path, key))
-
-
-def as_toml(value: Any) -> str:
-    """Return a value as TOML, tables within lines."""
-    if isinstance(value, dict):
-        return f"{{ {', '.join(f'{toml_value(key)} = {as_toml(entry)}' for key, entry in value.items())} }}"
-    return f"[{', '.join(map(as_toml, value))}]" if isinstance(value, list) else toml_value(value)
-
-
 def test_unknown_keys_are_refused_in_every_table_of_every_recipe(tmp_path):
     count, file = 0, tmp_path / "changed.toml"
     for name, text, read in recipes(tmp_path):
         values = parse_toml(text, name)
-        for path in tables_of(values):
+        for path in tables(values):
             changed = deepcopy(values)
-            table: Any = changed
-            for step in path:
-                table = table[step]
-            table[KEY] = 3
-            file.write_text("\n".join(f"{key} = {as_toml(value)}" for key, value in changed.items()))
+            at(changed, path)[KEY] = 3
+            file.write_bytes(document(changed))
             # The keys of splits are names that users choose, with shares that sum to 1.
             refused(lambda read=read: read(file), "sum to 1" if path == ("splits",) else KEY)
             count += 1

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from ...errors import InputError
-from ...files import ensure_folder, final_name, is_leftover, write_bytes
+from ...files import ensure_folder, final_name, is_leftover, refuse_links, write_bytes
 from ...memory import readable_size
 from ...progress import Progress, tell
 from ..cells import csv_line, csv_lines, escaped, unescaped
@@ -63,7 +63,9 @@ class ExportPlan:
         """Write the missing parts and the tables; `progress` is called as ``progress(done, total)`` after each event."""
         self._require_room()
         for name in {str(Path(file).parent) for part in self.missing for file in part.files}:
-            ensure_folder(self.folder / name)
+            if name != ".":
+                refuse_links(self.folder / name)
+                ensure_folder(self.folder / name)
         self._remove_leftovers()
         for path in self.changed:
             path.unlink(missing_ok=True)

@@ -19,7 +19,7 @@ class MPHDRR_UL_runs(bpy.types.UIList):
     ) -> None:  # fmt: skip
         row = layout.row(align=True)
         is_shown = item.file == data.run_file
-        is_stale = is_shown and bool(runs.change_lines(context.scene))
+        is_stale = is_shown and runs.has_scene_changed(context.scene)
         eye = "ERROR" if is_stale else "HIDE_OFF" if is_shown else "BLANK1"
         row.prop(item, "name", text="", emboss=False, icon=eye)
         size = row.row()
@@ -74,8 +74,9 @@ def draw_changes(layout: bpy.types.UILayout, scene: bpy.types.Scene) -> None:
     if not (lines := runs.change_lines(scene)):
         return
     box = layout.box()
-    box.alert = lines != [runs.UNKNOWN]
-    draw_text(box, "Not of the scene as it is now:" if box.alert else "Shown run:")
+    box.alert = runs.has_scene_changed(scene)
+    others = "Shown run:" if lines == [runs.UNKNOWN] else "Shown run, of other settings than the panel's:"
+    draw_text(box, "Not of the scene as it is now:" if box.alert else others, "ERROR" if box.alert else "INFO")
     column = box.column(align=True)
     for line in lines:
         draw_text(column, line, icon="DOT")

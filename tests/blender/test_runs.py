@@ -83,6 +83,8 @@ EDITS = {
     "seed none, now 4": (lambda: set_(noise=True, seed=4), lambda: set_(noise=False)),
 }  # fmt: skip
 
+PANEL = ("time", "isotope", "model ", "pixels", "modules all, now", "seed")
+
 
 @pytest.mark.parametrize(
     "said", [pytest.param(said, marks=() if i % 2 == 0 else pytest.mark.long) for i, said in enumerate(EDITS)]
@@ -95,6 +97,7 @@ def test_whatever_changes_is_said_until_it_goes_back(render, scene, said):
     edit()
     update()
     assert runs.changes(scene) == [said]
+    assert runs.has_scene_changed(scene) != said.startswith(PANEL), "a setting of the panel alone marks no tile"
     if back is not None:
         back()
         update()
@@ -279,5 +282,6 @@ def test_a_volume_that_is_not_in_the_panel_is_found_again(render, scene):
     assert runs.changes(scene) == [] and runs.volume_to_render(scene) == "Derenzo"
     set_(volume=bpy.data.objects["Other"])
     assert runs.changes(scene) == ["volume Derenzo, now Other"] and runs.volume_to_render(scene) == ""
+    assert not runs.has_scene_changed(scene)
     assert bpy.ops.mphdrr.render_projections() == {"FINISHED"}
     assert runs.changes(scene) == [] and rendering.run_file_path(scene.mphdrr_projections.run_file)

@@ -126,7 +126,8 @@ class MPHDRR_OT_renumber_modules(selection.OnScanner, bpy.types.Operator):
 
     def change(self, context: bpy.types.Context, collection: bpy.types.Collection) -> str:
         changed = module_edits.renumber(collection, self.order)
-        return f"Numbered {ids.counted(len(scanner.modules(collection)), 'module')}: {changed} have another number than before"
+        modules = ids.counted(len(scanner.modules(collection)), "module")
+        return f"Numbered {modules}: {changed} have another number than before"
 
 
 class MPHDRR_OT_reset_cameras(selection.OnScanner, bpy.types.Operator):

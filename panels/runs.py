@@ -22,9 +22,6 @@ class MPHDRR_UL_runs(bpy.types.UIList):
         is_stale = is_shown and runs.has_scene_changed(context.scene)
         eye = "ERROR" if is_stale else "HIDE_OFF" if is_shown else "BLANK1"
         row.prop(item, "name", text="", emboss=False, icon=eye)
-        size = row.row()
-        size.alignment, size.active = "RIGHT", False
-        size.label(text=runs.file_size_text([item]))
         row.prop(item, "keep", text="", icon="PINNED" if item.is_kept else "UNPINNED", emboss=False)
 
 

@@ -75,8 +75,12 @@ def add_run(
         if not settings.runs[index].is_saved:
             remove_file(settings.runs[index])
         settings.runs.remove(index)
+    time, (n_v, n_u) = run.settings.get("time"), run.views.shape
+    seconds = f"{time:g} s" if isinstance(time, int | float) else None
     names = [run.settings.get(key) for key in ("volume", "counts")]
-    name = ", ".join(filter(None, [*names, _label("model.kind", run.settings.get("model"))])) or "Run"
+    # What differs from run to run stands first: the list is narrow.
+    words = [_label("model.kind", run.settings.get("model")), seconds, f"{n_u} × {n_v}", *names]
+    name = ", ".join(filter(None, words))
     names_in_list, number = {item.name for item in settings.runs}, 2
     unique = name
     while unique in names_in_list:

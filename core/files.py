@@ -222,6 +222,14 @@ def require_file(path: AnyPath, expected: str = "a file", is_input: bool = True)
     return note_input(path) if is_input else path
 
 
+def relative_path(path: AnyPath, folder: AnyPath) -> str:
+    """Return a file's path relative to `folder`, with / on every system; the absolute path for a file on another drive."""
+    try:
+        return Path(os.path.relpath(path, folder)).as_posix()
+    except ValueError:
+        return Path(path).absolute().as_posix()
+
+
 def find_ending(path: AnyPath, endings: Sequence[str]) -> str:
     """Return the first of `endings` with which the file's name ends, whatever its case, or "" if none fits."""
     name = Path(path).name.lower()

@@ -5,7 +5,7 @@ from bpy.props import EnumProperty, FloatProperty, FloatVectorProperty, StringPr
 
 from ..addon import preferences, recovery
 from ..addon.blender import choices, decimals, jobs, storage
-from ..addon.blender.reports import Reported, ask_to_remove, needs
+from ..addon.blender.reports import Need, Reported, ask_to_remove, needs
 from ..addon.volumes import slices, volume_import, volume_materials, volumes
 from ..core.errors import InputError
 from ..core.physics.isotopes import ISOTOPES
@@ -34,14 +34,9 @@ class MPHDRR_OT_remove_slices(Reported, bpy.types.Operator):
         slices.remove_slices(context.object)
 
 
-def _is_activity(context: bpy.types.Context) -> bool:
-    """Return whether the active object is a volume of activity."""
-    return volumes.is_volume(context.object) and volumes.quantity_of(context.object) == "activity"
-
-
-def _is_ct(context: bpy.types.Context) -> bool:
-    """Return whether the active object is a volume of CT numbers."""
-    return volumes.is_volume(context.object) and volumes.quantity_of(context.object) == "hu"
+def _active(quantity: str, problem: str) -> Need:
+    """Return the need of an active volume of a quantity, with the tooltip's text where there is none."""
+    return lambda context: volumes.is_volume(item := context.object) and volumes.quantity_of(item) == quantity, problem
 
 
 class MPHDRR_OT_ct_to_attenuation(jobs.JobOperator, bpy.types.Operator):
@@ -54,7 +49,7 @@ class MPHDRR_OT_ct_to_attenuation(jobs.JobOperator, bpy.types.Operator):
         name="Energy (keV)", description="Tc-99m: 140.5; a CT of 120 kV: about 70", default=140.5, min=10.0, max=1000.0
     )
 
-    poll = needs((_is_ct, "No CT is active: select a volume of CT numbers (hu)"))
+    poll = needs(_active("hu", "No CT is active: select a volume of CT numbers (hu)"))
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
         return volume_import.attenuation_job(context.object, decimals.typed(self.energy))
@@ -67,7 +62,7 @@ class MPHDRR_OT_add_dose_map(jobs.JobOperator, bpy.types.Operator):
                           items=choices.items({}, ((name, name, "") for name in ISOTOPES)),
                           default="Tc-99m")  # fmt: skip
 
-    poll = needs((_is_activity, "No activity is active: select a volume of activity"))
+    poll = needs(_active("activity", "No activity is active: select a volume of activity"))
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
         return volume_import.dose_job(context.object, self.isotope)

@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 import bpy
 
 from ...core.errors import InputError, refusing, several, warn
-from ...core.files import ensure_folder, replacing
+from ...core.files import ensure_folder, relative_path, replacing
 from ...core.memory import readable_size
 from . import ids
 
@@ -403,10 +403,8 @@ def after_load(*_: Any) -> None:
 
 def _relative_path(folder: Path, path: Path) -> str:
     """Return the `//` path by which a .blend in a folder names a file; the absolute path for a file on another drive."""
-    try:
-        return "//" + Path(os.path.relpath(path, folder)).as_posix()
-    except ValueError:  # another drive
-        return str(path)
+    relative = relative_path(path, folder)
+    return str(path) if os.path.isabs(relative) else f"//{relative}"
 
 
 def _is_too_large(file: Path, size: int, target: Path) -> bool:

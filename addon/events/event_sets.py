@@ -210,8 +210,7 @@ def _recipe_reader(filepath: str, folder: str) -> Callable[[], events.EventRecip
     if filepath:
         path = storage.absolute(filepath)
         return lambda: events.read_recipe(path)
-    if folder and SetFolder(storage.absolute(folder)).recipe_path.is_file():
-        set_folder = SetFolder(storage.absolute(folder))
+    if folder and (set_folder := SetFolder(storage.absolute(folder))).recipe_path.is_file():
         return lambda: set_folder.recipe
     raise InputError("no recipe given: choose one, or write one with New Recipe")
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...core import Cancelled
-from ...core.errors import InputError
+from ...core.errors import InputError, first_line
 from ...core.figures.page import Page
 from ...core.files import write_bytes
 from ..blender import compat, ids, jobs
@@ -52,7 +52,7 @@ def render_to_file(scene: bpy.types.Scene, path: Path, animation: bool = False) 
         finally:
             view.render_display_type = old_display_type
     except RuntimeError as error:
-        raise InputError(f"Blender cannot render the figure: {str(error).strip().splitlines()[0]}") from error
+        raise InputError(f"Blender cannot render the figure: {first_line(error)}") from error
     while bpy.app.is_job_running("RENDER"):
         time.sleep(_PAUSE)
         yield

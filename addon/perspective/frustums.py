@@ -17,7 +17,7 @@ from mathutils import Matrix
 from numpy.typing import NDArray
 
 from ...core import InputError, PerspectiveGrid, Views, from_perspective, memory, to_perspective
-from ...core.geometry.frames import affine_matrix
+from ...core.geometry.frames import affine_matrix, moved
 from ...core.progress import Progress, Stages, stages_of, tell
 from ...core.runs.mosaic import as_seen, png_bytes
 from ...core.runs.run_recipe import recipe_views
@@ -290,8 +290,7 @@ def _add_frustum(
 ) -> None:
     """Add a frustum to the scene: lines around the layers and from the pinhole, and a picture for each layer."""
     collection = objects.ensure_collection(scene, ids.PERSPECTIVES)
-    to_camera = np.linalg.inv(objects.world_matrix(camera))
-    corners = _corners(g) @ to_camera[:3, :3].T + to_camera[:3, 3]  # (n_k, 4, 3)
+    corners = moved(np.linalg.inv(objects.world_matrix(camera)), _corners(g))  # (n_k, 4, 3)
     name = ids.part_name(camera.name, "perspective")
     frustum = bpy.data.objects.new(name, _line_mesh(name, corners))
     frustum[_KEY] = json.dumps(request.state)

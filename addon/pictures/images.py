@@ -166,8 +166,7 @@ def mosaic_views(mosaic: bpy.types.Image) -> tuple[Views, NDArray[np.float64]] |
 
 def shown_fraction() -> tuple[float, float]:
     """Return the fractions of the exact images' width and height that the pictures show."""
-    mosaic = bpy.data.images.get(ids.MOSAIC)
-    x, y = (1.0, 1.0) if mosaic is None or _TILES not in mosaic else mosaic[_TILES].get("share", (1.0, 1.0))
+    x, y = (tiles(bpy.data.images.get(ids.MOSAIC)) or {}).get("share", (1.0, 1.0))
     return x, y
 
 

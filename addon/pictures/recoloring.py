@@ -71,15 +71,10 @@ def recoloring() -> Generator[None, None, None]:
 def _take_turn() -> float | None:
     """Do some steps; return the seconds until the next turn, None when done."""
     global _steps
-    _steps = _steps or recoloring()
+    steps, _steps = _steps or recoloring(), None  # None, too, where a step fails
     deadline = time.perf_counter() + _TURN_TIME
-    while time.perf_counter() < deadline:
-        try:
-            next(_steps)
-        except StopIteration:
-            _steps = None
-            return None
-        except BaseException:
-            _steps = None
-            raise
-    return _INTERVAL
+    for _step in steps:
+        if time.perf_counter() >= deadline:
+            _steps = steps
+            return _INTERVAL
+    return None

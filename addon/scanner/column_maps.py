@@ -11,6 +11,7 @@ import bpy
 from bpy.props import BoolProperty, CollectionProperty, EnumProperty, IntProperty, StringProperty
 
 from ...core import InputError, PinholeSystem, recording
+from ...core.errors import expecting
 from ...core.geometry.columns import ANGLE_UNITS, LENGTH_UNITS
 from ...core.workbook import ColumnMap, MappedColumn, MappedTable, draft_column_map, preview_workbook, read_system
 from ..blender import choices
@@ -250,10 +251,8 @@ def _parse_rows(text: str, i: int) -> tuple[int, ...]:
     rows: set[int] = set()
     for part in filter(None, (part.strip() for part in text.split(","))):
         first, _, last = part.partition("-")
-        try:
+        with expecting(f"table {i + 1}: skip rows {text!r}, expected numbers such as 43, 50-52"):
             rows.update(range(int(first), int(last or first) + 1))
-        except ValueError:
-            raise InputError(f"table {i + 1}: skip rows {text!r}, expected numbers such as 43, 50-52") from None
     return tuple(sorted(rows))
 
 

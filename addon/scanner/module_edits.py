@@ -124,8 +124,7 @@ def _add_parts(collection: bpy.types.Collection, camera: bpy.types.Object) -> No
     for part in _build_parts(collection, camera):
         item = new_part(camera, ids.part_name(camera.name, part.kind), part)
         item.hide_viewport, item.hide_render = camera.hide_viewport, camera.hide_render
-        for owner in camera.users_collection:
-            owner.objects.link(item)
+        objects.link_beside(item, camera)
 
 
 def duplicate_modules(
@@ -155,8 +154,7 @@ def duplicate_modules(
         copy = camera.copy()
         copy.data = camera.data.copy()
         copy.animation_data_clear()
-        for owner in camera.users_collection:
-            owner.objects.link(copy)
+        objects.link_beside(copy, camera)
         objects.set_world_matrix(copy, cameras.camera_matrices(module.poses())[0], ("scale",))
         make_module(collection, copy, module)
         copies_.append(copy)

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from ...core import Progress, memory, volume_to_mesh, voxelize_mesh
 from ...core.errors import InputError, naming
+from ...core.geometry.frames import moved
 from ...core.geometry.grid import grid_around
 from ...core.volumes.meshes.mesh import Mesh, require_closed
 from ...core.volumes.volume import UNITS, Volume
@@ -117,16 +118,15 @@ def _closed_meshes(evaluated: bpy.types.Object, pose: NDArray[np.float64], name:
     if np.linalg.det(pose[:3, :3]) < 0:  # a mirrored object shows the other side of its faces
         faces = faces[:, ::-1]
     with naming(repr(name)):
-        result = Mesh(points.astype(np.float64) @ pose[:3, :3].T + pose[:3, 3], faces.astype(np.int64))
+        result = Mesh(moved(pose, points.astype(np.float64)), faces.astype(np.int64))
         require_closed(result)
     return [result]
 
 
 def add_mesh(mesh: Mesh, name: str, pose: NDArray[np.float64], collection: bpy.types.Collection) -> bpy.types.Object:
     """Return a new object for a mesh in world mm, with its origin and axes at the world-from-object matrix `pose` (4, 4)."""
-    object_from_world = np.linalg.inv(pose)
     data = bpy.data.meshes.new(name)
-    vertices = mesh.vertices @ object_from_world[:3, :3].T + object_from_world[:3, 3]
+    vertices = moved(np.linalg.inv(pose), mesh.vertices)
     faces = mesh.faces if np.linalg.det(pose[:3, :3]) > 0 else mesh.faces[:, ::-1]
     data.vertices.add(len(vertices))
     data.vertices.foreach_set("co", vertices.astype(np.float32).ravel())

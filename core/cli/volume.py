@@ -31,8 +31,7 @@ def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
 
     convert = add_run(actions, "convert", _convert)
     _add_input(convert)
-    steps = convert.add_argument_group("changes, in this order")
-    add = steps.add_argument
+    add = convert.add_argument_group("changes, in this order").add_argument
     add("--canonical", action="store_true", help="flip and transpose: index axes to the right, front and head")
     box = ("X0", "X1", "Y0", "Y1", "Z0", "Z1")
     add("--crop", type=float, nargs=6, metavar=box, help="crop to a box, mm, in FILE's world")
@@ -51,8 +50,7 @@ def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
     tag = "tag of patient, study or series for .dcm, as PatientName=Doe^Jo; may be repeated"
     convert.add_argument("--tag", action="append", default=[], metavar="KEYWORD=VALUE", help=tag)
 
-    from_mesh = add_run(actions, "from-mesh", _from_mesh)
-    add = from_mesh.add_argument
+    add = add_run(actions, "from-mesh", _from_mesh).add_argument
     add("mesh", nargs="+", metavar="MESH", help=f"{', '.join(MESH_FORMATS)}; later ones replace earlier ones")
     add("--unit", **_MESH_UNIT)
     add("--value", type=float, nargs="+", default=[1.0], metavar="X", help="value inside, one for all or one per mesh")

@@ -19,8 +19,7 @@ def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
     """Add the command ``mphdrr xray`` with its actions."""
     actions = add_actions(subparsers, "xray", "mphdrr xray kerma both.xlsx")
 
-    motion = add_run(actions, "motion", _motion)
-    add = motion.add_argument
+    add = add_run(actions, "motion", _motion).add_argument
     add("radiographs", metavar="RUN", help="radiographs of the body now")
     add("reference", metavar="VOLUME", help="attenuation of the body before, such as a reconstruction")
     add("--change", metavar="FILE", help=f"also write the change beside the motion: {', '.join(VOLUME_FORMATS)}")
@@ -30,8 +29,7 @@ def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
     add_workbook(kerma)
     kerma.add_argument("--json", action="store_true", help="print JSON")
 
-    dose = add_run(actions, "dose", _dose)
-    add = dose.add_argument
+    add = add_run(actions, "dose", _dose).add_argument
     add("activity", metavar="VOLUME", help="activity, kBq/mL")
     add("--isotope", required=True, choices=tuple(mph.ISOTOPES), help="isotope of the activity")
     add("--ct", metavar="VOLUME", help="CT numbers, for the density 1 + HU / 1000 g/cm^3; default: water everywhere")

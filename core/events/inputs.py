@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..errors import InputError
+from ..errors import InputError, refusing
 from ..files import write_bytes
 from ..runs.run_recipe import read_mu
 from ..volumes.volume import Volume
@@ -63,10 +63,8 @@ def original_input(name: str, folder: Path, content: str) -> Input:
 def _sha256(path: Path, content: str, is_copy: bool) -> str:
     """Return the SHA-256 of a plain file's bytes, or of a volume's values, affine and quantity."""
     if content == "copy":
-        try:
+        with refusing(path, "cannot be read"):
             return hashlib.sha256(path.read_bytes()).hexdigest()
-        except OSError as error:
-            raise InputError(f"{path}: {error.strerror or error}") from None
     volume = read_volume(path) if is_copy else _read_original(path, content)
     digest = hashlib.sha256(f"{volume.quantity} {volume.grid.shape}".encode())
     digest.update(np.ascontiguousarray(volume.grid.affine, "<f8").tobytes())

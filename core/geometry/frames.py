@@ -73,6 +73,11 @@ def rotations(vectors: Floats) -> Floats:
     return np.eye(3) + np.sinc(angle / np.pi) * cross + 0.5 * np.sinc(angle / (2 * np.pi)) ** 2 * (cross @ cross)
 
 
+def unit_vectors(vectors: Floats) -> Floats:
+    """Return `vectors` (…, 3) scaled to length 1."""
+    return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
+
+
 def cross_matrix(vectors: Floats) -> Floats:
     """Return the matrices (…, 3, 3) of the cross product with `vectors` a (…, 3): ``matrix @ b = a x b``."""
     x, y, z = np.moveaxis(vectors, -1, 0)

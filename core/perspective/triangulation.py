@@ -14,6 +14,7 @@ import numpy as np
 
 from ..arrays import ArrayLike, Floats, Indexes
 from ..errors import InputError
+from ..geometry.frames import unit_vectors
 from ..geometry.views import Views
 from ..validation import freeze, lengths, real_array
 from .view_rays import Indices, rays_by_depth, view_indices
@@ -194,7 +195,7 @@ def _residuals(
 def _nearest_to_rays(views: Views, index: Indexes, pixels: Floats) -> Floats:
     """Return the point (3,), mm, with the smallest sum of squared distances from the pixels' rays."""
     starts, directions = rays_by_depth(views, index, pixels)
-    directions = directions / np.linalg.norm(directions, axis=1, keepdims=True)
+    directions = unit_vectors(directions)
     angle = float(np.linalg.norm(np.cross(directions[:, None], directions[None]), axis=-1).max())
     if angle < _LEAST_ANGLE:
         reason = f"the rays are parallel to {angle:.1g} rad, so the depth of the point is unknown"

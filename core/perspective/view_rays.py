@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from ..arrays import Array, ArrayLike, Floats, Indexes
 from ..errors import InputError, expecting
-from ..geometry.frames import cross_matrix
+from ..geometry.frames import cross_matrix, unit_vectors
 from ..geometry.views import Views
 from ..validation import instance, real_array
 
@@ -46,7 +46,7 @@ def view_frames(views: Views) -> Floats:
     about k. Where pixels are mirrored, rows run along -v.
     """
     instance(views, Views, "frames: views")
-    u = views.u_steps / np.linalg.norm(views.u_steps, axis=1, keepdims=True)
+    u = unit_vectors(views.u_steps)
     k = np.cross(u, views.v_steps)
     distance = np.einsum("mi,mi->m", k, views.detector_centers - views.sources)
     k *= (np.sign(distance) / np.linalg.norm(k, axis=1))[:, None]

@@ -32,9 +32,9 @@ def mass_attenuation(symbol: str, energy: float) -> float:
     return float(np.exp(curve[-1]))  # the cubic's value at log(1)
 
 
-def table_lines(name: str) -> list[str]:
-    """Read the lines of a table in this folder, without its comments."""
-    text = Path(__file__).with_name(name).read_text(encoding="ascii")
+def table_lines(name: str, beside: str = __file__) -> list[str]:
+    """Read the lines of a text table in the folder of the file `beside`, without its comments."""
+    text = Path(beside).with_name(name).read_text(encoding="ascii")
     return [line for line in text.splitlines() if not line.startswith("#")]
 
 

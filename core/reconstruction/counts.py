@@ -138,9 +138,8 @@ class CountLoop(Loop):
         self.sensitivities = [np.asarray(projector.T(image, self.preparing()), np.float32) for projector, image in ones]
         self.sensitivity: Array = sum(self.sensitivities[1:], self.sensitivities[0])
         if not self._resumed:
-            self._warn_of_unexplained(
-                self.mask if method == "BSREM" else self.values > 0
-            )  # zeros stay in other methods
+            # Zeros of the start stay in all methods but BSREM.
+            self._warn_of_unexplained(self.mask if method == "BSREM" else self.values > 0)
         self.visible = self.mask & (self.sensitivity > NEGLIGIBLE)
         self.prior, self.penalty = prior, make_penalty(prior, A.grid, self.visible)
         self._images: Array | None = None  # of the volume in the last call of `objective`

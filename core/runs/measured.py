@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from ..arrays import Array, ArrayLike
-from ..errors import InputError, expecting, naming, number_ranges, warn
+from ..errors import InputError, expecting, naming, number_ranges, several, warn
 from ..files import read_text
 from ..geometry.scanner import Detector, Scanner
 from ..memory import require
@@ -356,5 +356,4 @@ def _warn_of_contradictions(counts: Counts, used: list[int], words: list[str], r
 
 def _ranges(numbers: Sequence[int]) -> str:
     """Return numbers as ranges: "1-3, 7"."""
-    texts = number_ranges(numbers)
-    return ", ".join(texts if len(texts) <= 6 else [*texts[:5], "…"])
+    return several(number_ranges(numbers), 6)

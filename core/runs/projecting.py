@@ -189,16 +189,11 @@ def warn_of_images(volume: Volume, views: Views, model: Model) -> None:
     """Warn of activity below 0, pixels beside the crystals, and a volume that the modules do not see whole."""
     for text in model.image_warnings(volume, views):
         warn(text)
-    _warn_of_unseen(volume, views, model.ends_at_detector)
-
-
-def _warn_of_unseen(volume: Volume, views: Views, ends_at_plane: bool) -> None:
-    """Warn of a volume beside the isocentre, or beyond the plane at which the rays end (`ends_at_plane`)."""
     index = volume.grid.index_from_world[:3, 3]
     if np.any(index < -0.5) or np.any(index > np.array(volume.grid.shape) - 0.5):
         warn("the isocentre, at which the modules aim, lies outside the volume's grid: check the volume's position")
     corners = np.concatenate([volume.grid.corners(), np.ones((8, 1))], axis=1)
     depth = corners @ views.projection_matrices()[:, 2].T  # (8, M), 1 at the virtual detector's plane
     cut = int(np.any(depth > 1, axis=0).sum())
-    if ends_at_plane and cut:
+    if model.ends_at_detector and cut:
         warn(f"{cut} of {len(views)} virtual detectors stand in front of parts of the volume: raise the magnification")

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import InputError, naming
-from ..files import AnyPath, note_input, require_ending, write_bytes
+from ..files import AnyPath, note_input, relative_path, require_ending, write_bytes
 from ..phantoms.settings import setting_names
 from ..recipes.settings import Setting
 from ..recipes.toml import read_toml, toml_value
@@ -136,15 +136,7 @@ def write_recipe(recipe: Recipe, path: AnyPath) -> None:
     """
     path = Path(path)
     require_ending(path, (".toml",))
-
-    def relative(name: str) -> str:
-        """Return a file's path relative to the recipe's folder."""
-        try:
-            return os.path.relpath(name, path.parent)
-        except ValueError:  # on another drive
-            return os.path.abspath(name)
-
-    recipe = _with_paths(recipe, relative)
+    recipe = _with_paths(recipe, lambda name: relative_path(name, path.parent))
     lines = ["# How to make projections with mphDRR: mphdrr project FILE -o run.h5"]
     for table in TABLES:
         lines += ["", f"[{table}]"]

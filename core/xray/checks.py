@@ -35,9 +35,8 @@ class ShadowedCone(Finding):
     message = "source {0.module}: {0.share:.2%} of its cone is blocked, {1}"
 
     def __str__(self) -> str:
-        rest = f" and {len(self.bodies) - _MAX_NAMED} more" if len(self.bodies) > _MAX_NAMED else ""
-        largest = ", ".join(f"{share:.2%} by {body}" for body, share in self.bodies[:_MAX_NAMED])
-        return self.message.format(self, largest + rest)
+        texts = (f"{share:.2%} by {body}" for body, share in self.bodies)
+        return self.message.format(self, several(texts, _MAX_NAMED))
 
 
 @dataclass(frozen=True)

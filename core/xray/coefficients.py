@@ -1,13 +1,12 @@
 """Photon coefficients of materials at many energies, and the table of water in photon_data.txt."""
 
 from functools import cache
-from pathlib import Path
 
 import numpy as np
 
 from ..arrays import Floats
 from ..errors import InputError
-from ..physics.mass_attenuation import mass_attenuation
+from ..physics.mass_attenuation import mass_attenuation, table_lines
 from ..physics.materials import MATERIALS, attenuation
 from ..validation import freeze
 
@@ -44,17 +43,11 @@ def photon_data() -> Floats:
 
 def table_numbers(name: str) -> Floats:
     """Return the numbers of a text table in this folder (rows, columns); short rows are filled up with zeros."""
-    rows = [line.split() for line in table_lines(name)]
+    rows = [line.split() for line in table_lines(name, __file__)]
     numbers = np.zeros((len(rows), max(map(len, rows))))
     for row, values in zip(numbers, rows, strict=True):
         row[: len(values)] = [float(value) for value in values]
     return freeze(numbers)
-
-
-def table_lines(name: str) -> list[str]:
-    """Return the lines of a text table in this folder, without comments."""
-    text = Path(__file__).with_name(name).read_text(encoding="ascii")
-    return [line for line in text.splitlines() if not line.startswith("#")]
 
 
 def interpolate_log(energies: Floats, table_energies: Floats, values: Floats) -> Floats:

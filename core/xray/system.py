@@ -9,7 +9,7 @@ import numpy as np
 from ..arrays import Array, ArrayLike, Bools, Floats, Integers
 from ..errors import InputError
 from ..geometry.columns import Column, ColumnTable, Values
-from ..geometry.frames import affine_matrix
+from ..geometry.frames import affine_matrix, unit_vectors
 from ..geometry.module_parts import BOX_FACES, ModulePart
 from ..geometry.scanner import Detector, Fault, Finding, Scanner, first_true
 from ..geometry.views import Views
@@ -81,11 +81,6 @@ def filter_thicknesses(text: str) -> dict[str, float]:
         name, _, mm = filter_.strip().rpartition(" ")
         thicknesses[name.strip()] = thicknesses.get(name.strip(), 0.0) + float(mm)
     return thicknesses
-
-
-def _unit(vectors: Floats) -> Floats:
-    """Return vectors (N, 3) scaled to length 1."""
-    return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
 
 
 def _is_mirrored(sources: Floats, centers: Floats, u: Floats, v: Floats) -> Bools:
@@ -177,13 +172,13 @@ class XraySystem(Scanner):
 
     def poses(self) -> Floats:
         """Return the world-from-module poses (N, 4, 4): columns u and v along the pixels, k across them, and sources, mm."""
-        u = _unit(self.panel_u)
-        k = _unit(np.cross(u, self.panel_v))
+        u = unit_vectors(self.panel_u)
+        k = unit_vectors(np.cross(u, self.panel_v))
         return affine_matrix(np.stack([u, np.cross(k, u), k], axis=2), self.sources)
 
     def attributes_at(self, poses: Floats) -> dict[str, Array]:
         """Return the attributes of sources at these poses (N, 4, 4), with panels that move along rigidly."""
-        deltas = poses[:, :3, :3] @ self.poses()[:, :3, :3].transpose(0, 2, 1) - np.eye(3)
+        deltas = poses[:, :3, :3] @ self.frames() - np.eye(3)
         deltas[np.abs(deltas).max(axis=(1, 2)) < _ROUNDING] = 0.0  # a mere shift changes no digit of the steps
         arms = {"panel_u": self.panel_u, "panel_v": self.panel_v, "panel_centers": self.panel_centers - self.sources}
         moved = {name: getattr(self, name) + np.einsum("mij,mj->mi", deltas, arm) for name, arm in arms.items()}
@@ -212,9 +207,9 @@ class XraySystem(Scanner):
         v = self.panel_v * (self.pixel_rows / n_v)[:, None]
         if pitch is not None:
             pitch_u, pitch_v = lengths(pitch, "pixel pitch", 2)
-            u, v = pitch_u * _unit(u), pitch_v * _unit(v)
+            u, v = pitch_u * unit_vectors(u), pitch_v * unit_vectors(v)
         x0, y0 = real_array(offset, "image offset", (2,))
-        return Views(self.sources, self.panel_centers + x0 * _unit(u) + y0 * _unit(v), u, v, (n_v, n_u))
+        return Views(self.sources, self.panel_centers + x0 * unit_vectors(u) + y0 * unit_vectors(v), u, v, (n_v, n_u))
 
     def parts(self, construction: Any = None) -> list[ModulePart]:
         """Return the solids of all sources: a cube behind the focal spot, for the tube, and the panel."""

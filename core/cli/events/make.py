@@ -20,8 +20,7 @@ if TYPE_CHECKING:
 
 def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
     """Add the action ``events make``."""
-    parser = add_set_action(actions, "make", _run)
-    add = parser.add_argument
+    add = add_set_action(actions, "make", _run).add_argument
     add("--recipe", metavar="FILE", help="recipe (.toml) of a new set, whose folder keeps a copy")
     add("-n", "--count", type=int, metavar="N", help="number of events; default: as in the call before")
     add("--first", type=int, default=0, metavar="I", help="number of the first event")

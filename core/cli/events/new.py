@@ -1,13 +1,12 @@
 """Action ``mphdrr events new --like derenzo``: a recipe to start from."""
 
 import argparse
-import os
 from pathlib import Path
 
 from ...errors import InputError
 from ...events.templates import TEMPLATES, template_text
 from ...example import EXAMPLE
-from ...files import write_bytes
+from ...files import relative_path, write_bytes
 from ..options import add_run, new_recipe_path, print_answer
 
 
@@ -36,20 +35,7 @@ def _run(arguments: argparse.Namespace) -> None:
         print_answer(arguments, {"file": None, "recipe": text}, [text.removesuffix("\n")])
         return
     path = new_recipe_path(arguments.output)
-    text = template_text(arguments.like, _path_for_recipe(path.parent, workbook))
+    text = template_text(arguments.like, EXAMPLE if workbook == EXAMPLE else relative_path(workbook, path.parent))
     write_bytes(path, text.encode())
     advice = f"{path}: edit it, then: mphdrr events make SET --recipe {path} -n 1000"
     print_answer(arguments, {"file": str(path), "recipe": text}, [advice])
-
-
-def _path_for_recipe(folder: Path, workbook: Path) -> str:
-    """Return a workbook's path for a recipe in `folder`: relative, with / on every system.
-
-    The example's path, and one on another drive, is absolute.
-    """
-    if workbook == EXAMPLE:
-        return workbook.as_posix()
-    try:
-        return Path(os.path.relpath(workbook, folder)).as_posix()
-    except ValueError:
-        return workbook.absolute().as_posix()

@@ -20,8 +20,7 @@ _COLUMNS = ("x_mm", "y_mm", "z_mm", "phi_degrees", "theta_degrees", "psi_degrees
 
 def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
     """Add the action ``events show``."""
-    parser = add_set_action(actions, "show", _run)
-    add = parser.add_argument
+    add = add_set_action(actions, "show", _run).add_argument
     text = f"numbers of the events; default: the first {_EVENTS_PER_SHEET} for a sheet, all for a list"
     add("--events", type=int, nargs="+", metavar="I", help=text)
     add("--model", metavar="NAME", help="model whose images are drawn; default: the recipe's first")

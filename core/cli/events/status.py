@@ -4,7 +4,7 @@ import argparse
 from dataclasses import asdict
 
 from ... import events
-from ...errors import number_ranges
+from ...errors import number_ranges, several
 from ...memory import readable_size
 from ..options import add_set_action, count_text, print_answer
 
@@ -30,11 +30,6 @@ def _run(arguments: argparse.Namespace) -> None:
         builds = ", ".join(f"{build or 'of version 0.1'} {count}" for build, count in status.builds.items())
         lines.append(f"builds of mphDRR: {builds}; events of two may differ in their last digits")
     if status.missing:
-        lines.append(f"missing: {numbers_text(status.missing)}; mphdrr events make {arguments.folder} makes them")
+        missing = several(number_ranges(status.missing), 10)
+        lines.append(f"missing: {missing}; mphdrr events make {arguments.folder} makes them")
     print_answer(arguments, asdict(status), lines)
-
-
-def numbers_text(numbers: list[int]) -> str:
-    """Return ascending whole numbers as text, such as "0-7, 12, 30-99"."""
-    texts = number_ranges(numbers)
-    return ", ".join(texts if len(texts) <= 10 else [*texts[:10], f"… ({len(numbers)} in all)"])

@@ -42,8 +42,7 @@ def _settable_columns() -> dict[str, tuple[Column, ...]]:
 
 def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
     """Add the action ``geometry set``."""
-    parser = add_action(actions, "set", _run)
-    add = parser.add_argument
+    add = add_action(actions, "set", _run).add_argument
     add("-o", "--output", required=True, metavar="OUT", help="workbook to write; if it is FILE, that is replaced")
     add("--modules", metavar="RANGE", help="modules to change, such as 1-40 or 1-20,41; default: all")
     for name, columns in _settable_columns().items():

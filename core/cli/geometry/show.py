@@ -15,8 +15,7 @@ from .arguments import add_action
 
 def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
     """Add the action ``geometry show``."""
-    parser = add_action(actions, "show", _run)
-    add = parser.add_argument
+    add = add_action(actions, "show", _run).add_argument
     add("--modules", metavar="RANGE", help="modules to show, such as 1-40 or 1-20,41; default: all")
     add("--write-columns", metavar="MAP", help="instead, write a draft of a column map (.toml), for you to check")
 

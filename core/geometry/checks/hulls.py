@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ...arrays import Floats, Integers
-from ..frames import moved
+from ..frames import moved, unit_vectors
 from ..module_parts import BOX_FACES, ModulePart
 from ..part_colors import PartKind
 
@@ -37,11 +37,11 @@ class Hulls:
         """Return the convex hulls of `parts`."""
         vertices = np.stack([moved(part.pose, _corners(part.solid[0])) for part in parts])
         a, b, _, d = (vertices[:, BOX_FACES[:, i]] for i in range(4))
-        normals = _unit(np.cross(b - a, d - a))
+        normals = unit_vectors(np.cross(b - a, d - a))
         centers = vertices.mean(axis=1)
         numbers, kinds = np.array([part.number for part in parts]), tuple(part.kind for part in parts)
         offsets = np.einsum("pfx,pfx->pf", normals, a)
-        edges = _unit(vertices[:, _EDGES[:, 1]] - vertices[:, _EDGES[:, 0]])
+        edges = unit_vectors(vertices[:, _EDGES[:, 1]] - vertices[:, _EDGES[:, 0]])
         radii = np.linalg.norm(vertices - centers[:, None], axis=2).max(axis=1)
         return cls(numbers, kinds, vertices, normals, offsets, edges, centers, radii)
 
@@ -58,8 +58,3 @@ def _corners(vertices: Floats) -> Floats:
         half_width = np.abs(vertices[vertices[:, 2] == z, :2]).max()
         corners.append(np.column_stack([half_width * _SQUARE, np.full(4, z)]))
     return np.concatenate(corners)
-
-
-def _unit(vectors: Floats) -> Floats:
-    """Return vectors (..., 3) scaled to length 1."""
-    return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)

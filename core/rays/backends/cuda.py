@@ -33,7 +33,7 @@ from torch import Tensor
 
 from ... import cache
 from ...arrays import ArrayOrTensor, Floats, is_tensor, to_caller, to_numpy, to_tensor
-from ...errors import InputError
+from ...errors import InputError, first_line
 from ...memory import readable_size
 from ..ray_geometry import Attenuation, IndexRays, Rays
 from . import reference
@@ -116,8 +116,7 @@ def device() -> Any:
         try:
             return wp.get_device(name)
         except (RuntimeError, ValueError) as error:
-            reason = str(error).splitlines()[0]
-            raise InputError(f"backend 'cuda': no NVIDIA GPU that can be used ({name}: {reason})") from None
+            raise InputError(f"backend 'cuda': no NVIDIA GPU that can be used ({name}: {first_line(error)})") from None
 
 
 def has_driver() -> bool:

@@ -18,7 +18,7 @@ from .pictures import images
 from .runs import rendering, runs
 from .scanner import scanner
 
-_VOXELS, _PIXELS = 128, 128
+_VOXELS, _PIXELS = 140, 128  # voxels at most half of the reconstruction's
 _VIEW = Euler((1.05, 0.0, 0.95))  # view from above, into the opening of the rings
 EXAMPLES = (
     ("DERENZO", "Derenzo Phantom", "What 80 modules see of a Derenzo phantom"),

@@ -13,7 +13,7 @@ class MPHDRR_OT_calibrate(jobs.JobOperator, bpy.types.Operator):
     from nominal to fitted pinholes.
     """
 
-    poll = reports.needs(selection.SCANNER)
+    poll = reports.needs(selection.SCANNER, reports.package("scipy"))
 
     asks_for = "filepath"
     filepath: file_properties.file_property("Recipe of the calibration")

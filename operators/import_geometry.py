@@ -7,7 +7,7 @@ from typing import Literal
 import bpy
 from bpy.props import BoolProperty, FloatProperty, IntVectorProperty, StringProperty
 
-from ..addon.blender import file_properties, layouts, reports
+from ..addon.blender import file_properties, ids, layouts, reports
 from ..addon.figures import studio
 from ..addon.scanner import column_maps, scanner, scanner_files
 from ..core import ColumnMap, InputError, PinholeSystem, kinds_in, read_scanner
@@ -118,7 +118,7 @@ class MPHDRR_OT_import_geometry(bpy.types.Operator):
         self._dialog = ""
         column_maps.clear(context.window_manager.mphdrr_columns)
         additions = "".join(f" and {len(further)} of the kind {further.kind}" for further in self._further_scanners)
-        return f"Imported {len(system)} modules{additions} into '{collection.name}'"
+        return f"Imported {ids.counted(len(system), 'module')}{additions} into '{collection.name}'"
 
     def cancel(self, context: bpy.types.Context) -> None:
         column_maps.clear(context.window_manager.mphdrr_columns)

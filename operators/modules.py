@@ -5,7 +5,7 @@ import math
 import bpy
 from bpy.props import BoolProperty, EnumProperty, FloatProperty, IntProperty
 
-from ..addon.blender import decimals, jobs, reports
+from ..addon.blender import decimals, ids, jobs, reports
 from ..addon.scanner import following, maps, module_edits, scanner, selection
 from ..addon.scanner.scanner_parts import modules_text
 
@@ -26,7 +26,7 @@ class MPHDRR_OT_show_modules(selection.OnScanner, bpy.types.Operator):
     )  # fmt: skip
 
     def change(self, context: bpy.types.Context, collection: bpy.types.Collection) -> str:
-        return f"{scanner.show_modules(collection, self.first, self.last, self.mode)} modules visible"
+        return f"{ids.counted(scanner.show_modules(collection, self.first, self.last, self.mode), 'module')} visible"
 
 
 class MPHDRR_OT_isolate_ring(selection.OnModules, bpy.types.Operator):
@@ -38,7 +38,9 @@ class MPHDRR_OT_isolate_ring(selection.OnModules, bpy.types.Operator):
         is_isolated = in_ring == {camera for camera in cameras if camera.mphdrr_module.visible}
         for camera in cameras:
             scanner.set_visible(camera, is_isolated or camera in in_ring)
-        return "All modules visible" if is_isolated else f"Ring {ring + 1}: {len(in_ring)} modules visible"
+        return (
+            "All modules visible" if is_isolated else f"Ring {ring + 1}: {ids.counted(len(in_ring), 'module')} visible"
+        )
 
 
 class MPHDRR_OT_look_through_module(selection.OnScanner, bpy.types.Operator):
@@ -124,7 +126,8 @@ class MPHDRR_OT_renumber_modules(selection.OnScanner, bpy.types.Operator):
 
     def change(self, context: bpy.types.Context, collection: bpy.types.Collection) -> str:
         changed = module_edits.renumber(collection, self.order)
-        return f"Numbered {len(scanner.modules(collection))} modules: {changed} have another number than before"
+        modules = ids.counted(len(scanner.modules(collection)), "module")
+        return f"Numbered {modules}: {changed} have another number than before"
 
 
 class MPHDRR_OT_reset_cameras(selection.OnScanner, bpy.types.Operator):
@@ -169,7 +172,7 @@ class MPHDRR_OT_check_geometry(selection.OnScanner, bpy.types.Operator):
             return "Nothing found"
         if cameras:
             selection.select(context, cameras)
-        return f"{len(findings)} findings at {len(cameras)} modules: see the Design panel"
+        return f"{ids.counted(len(findings), 'finding')} at {ids.counted(len(cameras), 'module')}: see the Design panel"
 
 
 class MPHDRR_OT_add_map(jobs.JobOperator, bpy.types.Operator):

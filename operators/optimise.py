@@ -2,7 +2,7 @@
 
 import bpy
 
-from ..addon.blender import file_properties, jobs
+from ..addon.blender import file_properties, jobs, reports
 from ..addon.scanner import optimising
 
 
@@ -12,6 +12,8 @@ class MPHDRR_OT_optimise(jobs.JobOperator, bpy.types.Operator):
     """
 
     bl_label = "Optimise Scanner"
+
+    poll = reports.needs(reports.package("scipy"))
 
     asks_for = "filepath"
     filepath: file_properties.file_property("Recipe of the design")

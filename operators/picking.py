@@ -42,7 +42,7 @@ class MPHDRR_OT_pick_pixel(eyedropper.Eyedropper, reports.Reported, bpy.types.Op
         coordinates = (decimals.typed(number) for number in (self.column, self.row, self.k))
         picked = epipolar.pick_pixel(context.scene, self.module, *coordinates)
         column, row = picked.pixel
-        return f"Module {self.module}, column {column:g}, row {row:g}: {picked.seen_by} modules see the marker"
+        return f"Module {self.module}, column {column:g}, row {row:g}: seen by {ids.counted(picked.seen_by, 'module')}"
 
     def target_under(self, context: bpy.types.Context, event: bpy.types.Event) -> tuple[int, int, int] | None:
         """Return the module's number, the column and the row of the pixel under the mouse, or None."""

@@ -48,6 +48,12 @@ class MPHDRR_OT_remove_run(Reported, bpy.types.Operator):
 
     index: IntProperty(name="Index", description="Place of the run in the list, from 0", min=0, options={"SKIP_SAVE"})
 
+    @classmethod
+    def description(cls, context: bpy.types.Context, properties: Any) -> str:
+        """Return the tooltip, with the size of the run's file."""
+        size = runs.file_size_text(context.scene.mphdrr_projections.runs[properties.index : properties.index + 1])
+        return f"{cls.bl_description}: {size}"
+
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
         item = _required_run(context.scene, self.index)
         message = "Neither Undo nor the .blend as it was saved will find its file again."

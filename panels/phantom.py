@@ -13,11 +13,17 @@ from .sidebar import Folded, Popover, draw_facts, draw_text
 
 
 class MPHDRR_PT_phantom(Folded, bpy.types.Panel):
+    bl_label = ""  # `draw_header` says what the volume is
     bl_order = ids.ORDER_PHANTOM
 
     poll = layouts.shown_where(
         lambda context: scanner.active_scanner(context.scene) is not None or volumes.volume_objects(context.scene)
     )
+
+    def draw_header(self, context: bpy.types.Context) -> None:
+        item = volumes.panel_volume(context)
+        is_phantom = item is None or phantoms.settings_of(item) is not None
+        self.layout.label(text="Phantom" if is_phantom else "Volume")
 
     def draw(self, context: bpy.types.Context) -> None:
         layout = layouts.invoking(layouts.labelled(self.layout))

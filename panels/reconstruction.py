@@ -3,7 +3,7 @@
 import bpy
 from bpy.app.translations import pgettext_iface as iface
 
-from ..addon.blender import ids, layouts, plots
+from ..addon.blender import ids, layouts, plots, reports
 from ..addon.reconstruction.reconstruction_properties import panel_properties
 from ..addon.runs import runs
 from .sidebar import Folded, Popover, draw_text
@@ -84,6 +84,8 @@ class MPHDRR_PT_reconstruction_model(Popover, bpy.types.Panel):
         if runs.holds_counts(context.scene):
             column.prop(settings, "mu", placeholder="The run's")
         layouts.draw_settings(column, settings, rest)
+        if not reports.has("torch"):
+            draw_text(column, "A method file needs torch, which is not in Blender", "INFO")
 
 
 class MPHDRR_PT_backprojection(Popover, bpy.types.Panel):

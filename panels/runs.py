@@ -19,12 +19,9 @@ class MPHDRR_UL_runs(bpy.types.UIList):
     ) -> None:  # fmt: skip
         row = layout.row(align=True)
         is_shown = item.file == data.run_file
-        is_stale = is_shown and bool(runs.change_lines(context.scene))
+        is_stale = is_shown and runs.has_scene_changed(context.scene)
         eye = "ERROR" if is_stale else "HIDE_OFF" if is_shown else "BLANK1"
         row.prop(item, "name", text="", emboss=False, icon=eye)
-        size = row.row()
-        size.alignment, size.active = "RIGHT", False
-        size.label(text=runs.file_size_text([item]))
         row.prop(item, "keep", text="", icon="PINNED" if item.is_kept else "UNPINNED", emboss=False)
 
 
@@ -74,8 +71,9 @@ def draw_changes(layout: bpy.types.UILayout, scene: bpy.types.Scene) -> None:
     if not (lines := runs.change_lines(scene)):
         return
     box = layout.box()
-    box.alert = lines != [runs.UNKNOWN]
-    draw_text(box, "Not of the scene as it is now:" if box.alert else "Shown run:")
+    box.alert = runs.has_scene_changed(scene)
+    others = "Shown run:" if lines == [runs.UNKNOWN] else "Shown run, of other settings than the panel's:"
+    draw_text(box, "Not of the scene as it is now:" if box.alert else others, "ERROR" if box.alert else "INFO")
     column = box.column(align=True)
     for line in lines:
         draw_text(column, line, icon="DOT")

@@ -1,7 +1,7 @@
 """Build the package's wheels, its source archive and the extension's zips in dist/, for each platform: `make dist`.
 
-The C kernels are compiled for all platforms here. A zip contains every wheel that it needs. Needs an environment with bpy,
-whose command-line tool builds and validates the zips; no Blender application is needed.
+The C kernels are compiled for all platforms here. A zip contains every wheel that it needs, for one of Blender's Pythons.
+Needs an environment with bpy, whose command-line tool builds and validates the zips; no Blender application is needed.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ import build_kernels
 ROOT = Path(__file__).resolve().parents[1]
 MANIFEST = ROOT / "blender_manifest.toml"
 
-# Pinned, so that a zip can be built again. numpy is Blender's own: 1.26 in 4.5, 2.2 or later in 5.2; the bounds of h5py
-# (1.21.2 on) hold both.
+# Pinned, so that a zip can be built again. numpy is Blender's own: 1.26 in 4.5, 2.2 or later in 5.2; those of the compiled
+# wheels' bounds (1.26.4 for SciPy) hold it.
 PURE = (
     "et-xmlfile==2.0.0",
     "importlib-resources==7.1.0",
@@ -38,9 +38,27 @@ PURE = (
     "typing-extensions==4.16.0",
 )
 STABLE_ABI = ("psutil==7.2.2",)
-# For Python 3.11 and for the others: from 2.4 on pylibjpeg-openjpeg asks for numpy 2, and 2.3 for macOS 14.
-COMPILED_311 = ("h5py==3.15.1", "pylibjpeg-openjpeg==2.2.1")
-COMPILED = ("h5py==3.15.1", "pylibjpeg-openjpeg==2.6.0")
+H5PY = "h5py==3.15.1"
+
+
+@dataclass(frozen=True)
+class BlenderPython:
+    """A Python of Blender: the versions that have it, and the compiled packages for it."""
+
+    name: str  # in the zip's name
+    first: str  # version of Blender
+    end: str | None  # the first version without it, None where the newest has it
+    compiled: tuple[str, ...]
+
+
+PYTHONS = {
+    # From 2.4 on pylibjpeg-openjpeg asks for numpy 2, and 2.3 for macOS 14; so does SciPy from 1.18 on.
+    "3.11": BlenderPython("blender_4.5", "4.5.0", "5.1.0", (H5PY, "pylibjpeg-openjpeg==2.2.1", "scipy==1.17.1")),
+    "3.13": BlenderPython("blender_5.1", "5.1.0", None, (H5PY, "pylibjpeg-openjpeg==2.6.0", "scipy==1.18.1")),
+    # Linux distributions build Blender on their own Python, and Blender refuses an extension that has compiled wheels but
+    # none for the Python it runs on.
+    "3.14": BlenderPython("python_3.14", "5.1.0", None, (H5PY, "pylibjpeg-openjpeg==2.6.0", "scipy==1.18.1")),
+}
 
 
 @dataclass(frozen=True)
@@ -48,19 +66,17 @@ class Platform:
     """Wheel tags and Python versions for pip."""
 
     tags: tuple[str, ...]
-    pythons: tuple[str, ...] = ("3.11", "3.13")  # Blender 4.5 and 5.0; 5.1 and later
+    pythons: tuple[str, ...] = ("3.11", "3.13")
 
 
 PLATFORMS = {
-    # 3.14: Linux distributions build Blender on their own Python, and Blender refuses an extension that has compiled
-    # wheels but none for the Python it runs on.
     "linux-x64": Platform(
         tuple(f"manylinux{tag}_x86_64" for tag in ("_2_28", "_2_27", "_2_17", "2014", "2010")), ("3.11", "3.13", "3.14")
     ),
     "windows-x64": Platform(("win_amd64",)),
     "macos-arm64": Platform(("macosx_12_0_arm64", "macosx_11_0_arm64")),
     # Blender 4.5 is the last for Intel Macs.
-    "macos-x64": Platform(("macosx_12_0_x86_64", "macosx_10_15_x86_64", "macosx_10_9_x86_64"), ("3.11",)),
+    "macos-x64": Platform(tuple(f"macosx_{tag}_x86_64" for tag in ("12_0", "10_15", "10_14", "10_9")), ("3.11",)),
 }
 
 
@@ -76,16 +92,13 @@ def download(folder: Path, packages: tuple[str, ...], *options: str) -> list[Pat
     return sorted(folder.glob("*.whl"))
 
 
-def wheels_for(name: str, folder: Path) -> list[Path]:
-    """Return all wheels of one platform."""
+def wheels_for(name: str, python: str, folder: Path) -> list[Path]:
+    """Return all wheels of one platform and Python."""
     platform = PLATFORMS[name]
     tags = [option for tag in platform.tags for option in ("--platform", tag)]
     wheels = download(folder / "any", PURE)
     wheels += download(folder / name / "abi3", STABLE_ABI, *tags, "--python-version", platform.pythons[0])
-    for python in platform.pythons:
-        compiled = COMPILED_311 if python == "3.11" else COMPILED
-        wheels += download(folder / name / python, compiled, *tags, "--python-version", python)
-    return wheels
+    return wheels + download(folder / name / python, PYTHONS[python].compiled, *tags, "--python-version", python)
 
 
 def source_files() -> list[Path]:
@@ -131,27 +144,33 @@ def build_source_archive(tree: Path, output: Path) -> None:
     subprocess.run((sys.executable, "-c", code), cwd=tree, check=True, stdout=subprocess.DEVNULL)
 
 
-def build_zip(name: str, tree: Path, output: Path) -> Path:
-    """Build the extension's zip for platform `name` from a copy of the tree, to which kernels and wheels are added."""
-    build_kernels.build(name, tree / build_kernels.KERNELS.relative_to(ROOT))
-    wheels = wheels_for(name, ROOT / "wheels")
+def build_zip(name: str, python: str, source: Path, output: Path) -> Path:
+    """Build the extension's zip for platform `name` and a Python from a copy of the tree, to which wheels are added."""
+    tree, blender = source.with_name(f"{source.name}-{python}"), PYTHONS[python]
+    shutil.copytree(source, tree)
+    wheels = wheels_for(name, python, ROOT / "wheels")
     (tree / "wheels").mkdir()
     for wheel in wheels:
         shutil.copyfile(wheel, tree / "wheels" / wheel.name)
-    manifest = tree / MANIFEST.name
-    given = manifest.read_text(encoding="utf-8")
-    declared = f"platforms = {toml_list(tomllib.loads(given)['platforms'])}\n"
-    if declared not in given:
-        raise SystemExit(f"{MANIFEST.name}: expected the platforms on one line, as in {declared.strip()}")
-    own_readme(tree, tomllib.loads(given).get("website"))
+    text = (tree / MANIFEST.name).read_text(encoding="utf-8")
+    given = tomllib.loads(text)
+    own_readme(tree, given.get("website"))
     listed = f"platforms = {toml_list([name])}\nwheels = [\n"
-    listed += "".join(f'  "./wheels/{wheel.name}",\n' for wheel in wheels) + "]\n"
-    manifest.write_text(given.replace(declared, listed), encoding="utf-8")
+    listed += "".join(f'  "./wheels/{wheel.name}",\n' for wheel in wheels) + "]"
+    versions = f'blender_version_min = "{blender.first}"'
+    versions += f'\nblender_version_max = "{blender.end}"' if blender.end else ""
+    for declared, replacement in (
+        (f"platforms = {toml_list(given['platforms'])}", listed),
+        (f'blender_version_min = "{given["blender_version_min"]}"', versions),
+    ):
+        if f"\n{declared}\n" not in text:
+            raise SystemExit(f"{MANIFEST.name}: expected a line {declared}")
+        text = text.replace(declared, replacement)
+    (tree / MANIFEST.name).write_text(text, encoding="utf-8")
     tool = (sys.executable, extension_tool())
-    options = ("--source-dir", tree, "--output-dir", output, "--split-platforms")  # adds the platform to the name
+    file = output / f"mphdrr-{given['version']}-{name.replace('-', '_')}-{blender.name}.zip"
+    options = ("--source-dir", tree, "--output-filepath", file)
     subprocess.run((*tool, "build", *options), check=True, stdout=subprocess.DEVNULL)
-    version = tomllib.loads(given)["version"]
-    file = output / f"mphdrr-{version}-{name.replace('-', '_')}.zip"
     subprocess.run((*tool, "validate", file), check=True, stdout=subprocess.DEVNULL)
     return file
 
@@ -182,12 +201,14 @@ def main() -> None:
         build_source_archive(Path(folder), arguments.output)
     for name in arguments.platform or names:
         with tempfile.TemporaryDirectory() as folder:
-            tree = Path(folder)
+            tree = Path(folder) / "tree"
             stage(tree)
             build_wheel(name, tree, arguments.output)
             if name in PLATFORMS:
-                file = build_zip(name, tree, arguments.output)
-                print(f"{os.path.relpath(file)}: {file.stat().st_size / 1e6:.1f} MB, valid")
+                build_kernels.build(name, tree / build_kernels.KERNELS.relative_to(ROOT))
+                for python in PLATFORMS[name].pythons:
+                    file = build_zip(name, python, tree, arguments.output)
+                    print(f"{os.path.relpath(file)}: {file.stat().st_size / 1e6:.1f} MB, valid")
             else:
                 print(f"{name}: a wheel alone, since there is no Blender for it")
 

@@ -58,3 +58,8 @@ def projection_name(number: int, n_modules: int = 80) -> str:
 def picture_name(projection: str) -> str:
     """Return the name of the coloured picture of a module's projection image: "mphDRR 07 picture"."""
     return f"{projection} picture"
+
+
+def counted(number: int, word: str) -> str:
+    """Return a number with a noun, such as "1 module" or "80 modules"."""
+    return f"{number} {word}{'s' * (number != 1)}"

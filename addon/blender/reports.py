@@ -3,11 +3,13 @@
 import re
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import cache
+from importlib.util import find_spec
 from typing import Any
 
 import bpy
 
-from ...core.errors import InputError
+from ...core.errors import InputError, install_advice
 from ...core.recording import recorded_warnings
 from ...core.runs.settings import SETTINGS
 
@@ -60,6 +62,17 @@ def needs(*requirements: Need) -> Any:
         return unmet is None
 
     return classmethod(poll)
+
+
+@cache
+def has(package: str) -> bool:
+    """Return whether Blender finds a Python package, without importing it."""
+    return find_spec(package) is not None
+
+
+def package(name: str) -> Need:
+    """Return the requirement of an operator that works with a Python package."""
+    return lambda _: has(name), f"{name} is missing: {install_advice(name)}"
 
 
 class Reported:

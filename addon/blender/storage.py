@@ -285,7 +285,7 @@ class _GatheredFiles:
 
 def _amount(files: dict[Path, int]) -> str:
     """Return the number of files and their total size in words."""
-    return f"{len(files)} file{'s' * (len(files) > 1)} ({readable_size(sum(files.values()))})"
+    return f"{ids.counted(len(files), 'file')} ({readable_size(sum(files.values()))})"
 
 
 def _gather_files(target: Path, is_wanted: Callable[[str, Path], bool]) -> _GatheredFiles:

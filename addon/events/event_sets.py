@@ -60,7 +60,7 @@ def write_recipe(scene: bpy.types.Scene, filepath: str, template: str) -> str:
     text = template_text(template, workbook.relative_to(path.parent).as_posix() if is_near else workbook)
     write_bytes(path, text.encode())
     scene.mphdrr_events.recipe = storage.stored_path(path)
-    return f"Wrote {path}, of {workbook.name}: edit it in any editor of text"
+    return f"Wrote {path}, of {workbook.name}: edit it in any text editor"
 
 
 def try_event_job(context: bpy.types.Context, filepath: str, number: int, folder: str = "") -> jobs.Job:

@@ -16,6 +16,7 @@ from ...core.runs.recipe import Recipe, fitting_recipe
 from ...core.runs.settings import SETTINGS
 from ..blender import choices
 from ..blender.file_properties import path_property
+from ..blender.reports import has
 from ..blender.setting_properties import make_check_marks, make_properties, properties_to_draw, read_values
 from ..volumes import volumes
 
@@ -47,7 +48,7 @@ class ReconstructionSettings:
 _FILES = ", ".join(METHOD_FILES)
 ReconstructionSettings.__annotations__ = make_properties(PROPERTIES)
 ReconstructionSettings.__annotations__["method_file"] = path_property(
-    "Method File", f"A trained network ({_FILES}) instead of the method; it has voxels of its own"
+    "Method File", f"A trained network ({_FILES}) instead of the method; it has voxels of its own, and needs torch"
 )
 _METHOD_FILE_NAMES = ("ignore_attenuation", "ignore_blur", "hole", "aperture_points", "pixel_points")
 """Settings of the model that also matter to methods in files."""
@@ -98,7 +99,7 @@ def panel_properties(settings: ReconstructionProperties) -> Iterator[tuple[str, 
     """Yield the properties that the chosen method and prior have, each with whether it has an effect."""
     settings_shown = {name: PROPERTIES[name] for name in _METHOD_FILE_NAMES} if settings.method_file else PROPERTIES
     yield from properties_to_draw(settings_shown, settings, lambda need: True)
-    yield "method_file", True
+    yield "method_file", has("torch")
 
 
 class ReconstructionProperties(ReconstructionSettings, bpy.types.PropertyGroup):

@@ -11,7 +11,7 @@ from ...core.geometry.system import chosen_modules
 from ...core.progress import Progress, stages_of
 from ...core.runs.measured import recipe_counts
 from ...core.runs.mosaic import counts_caption
-from ..blender import jobs
+from ..blender import ids, jobs
 from ..phantoms import phantoms
 from ..pictures import images
 from ..scanner import scanner
@@ -58,7 +58,7 @@ def import_counts_job(context: bpy.types.Context, paths: list[Path], entries: Ma
         owner = jobs.find_by_uid(bpy.data.collections, scanner_uid)
         state = runs.scene_state(system, run.recipe, None, None) | {"measured": counts_caption(run)}
         images.show_below((yield from rendering.store_and_show(scene, run, path, state, owner, pictures)), bpy.context)
-        total = f"{float(run.projections.sum(dtype=float)):.6g} counts of {len(run.views)} modules"
+        total = f"{float(run.projections.sum(dtype=float)):.6g} counts of {ids.counted(len(run.views), 'module')}"
         return f"Imported {total}: {counts_caption(run)}"
 
     return jobs.Job("Importing counts", work, finish, lambda: path.unlink(missing_ok=True))

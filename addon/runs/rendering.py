@@ -76,7 +76,8 @@ def render_job(context: bpy.types.Context, recipe: Recipe, volume: str = "", mu:
         path = storage.absolute(scene.mphdrr_projections.run_file)
         location = path if bpy.data.filepath else f"{path} until the .blend is saved"
         seconds = time.perf_counter() - start
-        return f"Projected {recipe['volume.object']!r} into {len(run.views)} modules in {seconds:.1f} s: {location}"
+        modules = ids.counted(len(run.views), "module")
+        return f"Projected {recipe['volume.object']!r} into {modules} in {seconds:.1f} s: {location}"
 
     def undo() -> None:
         """Remove the run files of a cancelled job."""

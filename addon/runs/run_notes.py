@@ -24,7 +24,7 @@ def draw() -> None:
     lines, stale = runs.change_lines(context.scene), runs.stale_modules(context.scene)
     if not images.belong_to(context.scene):
         lines, stale = ["the projections of another scene"], None
-    is_stale = bool(lines) and lines != [runs.UNKNOWN]
+    is_stale = stale != set()
     texts = [(f"Not of the scene as it is now: {', '.join(lines)}", _COLOR)] if is_stale else []
     if measured := runs.measured_text(context.scene):
         texts.append((measured, _PLAIN))

@@ -38,7 +38,8 @@ _DEFAULTS = {
 }
 """Defaults of the settings on which a run's numbers depend."""
 
-_Changes = list[tuple[str, list[int] | None]]  # words, and numbers of the modules concerned, None for all
+_Changes = list[tuple[str, list[int] | None]]
+"""Words, and numbers of the modules that the scene shows otherwise: None for all, none if only the panel has changed."""
 _last_seen: dict[str, _Changes] = {}  # the changes that the panels show, by scene
 
 
@@ -74,8 +75,12 @@ def add_run(
         if not settings.runs[index].is_saved:
             remove_file(settings.runs[index])
         settings.runs.remove(index)
+    time, (n_v, n_u) = run.settings.get("time"), run.views.shape
+    seconds = f"{time:g} s" if isinstance(time, int | float) else None
     names = [run.settings.get(key) for key in ("volume", "counts")]
-    name = ", ".join(filter(None, [*names, _label("model.kind", run.settings.get("model"))])) or "Run"
+    # What differs from run to run stands first: the list is narrow.
+    words = [_label("model.kind", run.settings.get("model")), seconds, f"{n_u} × {n_v}", *names]
+    name = ", ".join(filter(None, words))
     names_in_list, number = {item.name for item in settings.runs}, 2
     unique = name
     while unique in names_in_list:
@@ -163,6 +168,11 @@ def stale_modules(scene: bpy.types.Scene) -> set[int] | None:
     """Return the numbers of the modules whose images in the shown run are out of date; None: all of them."""
     numbers = [numbers for _, numbers in _last_changes(scene)]
     return None if None in numbers else {number for group in numbers for number in group or ()}
+
+
+def has_scene_changed(scene: bpy.types.Scene) -> bool:
+    """Return whether the scene, not only the panel, has changed since the shown run."""
+    return stale_modules(scene) != set()
 
 
 def change_lines(scene: bpy.types.Scene) -> list[str]:
@@ -276,12 +286,10 @@ def _differences(
     mu = panel.mu if settings["model.kind"] == "emission" else None
     # `fitting_recipe` also completes the hole's settings of an earlier version.
     old_settings = _effective_settings(fitting_recipe(old["settings"]))
-    texts_of_all = (
-        _volume_changes(scene, "", old["volume"], volume),
-        _volume_changes(scene, "attenuation ", old["mu"], mu),
-        _setting_changes(old_settings, settings),
-    )
-    yield from ((text, None) for texts in texts_of_all for text in texts)
+    for role, was, item in (("", old["volume"], volume), ("attenuation ", old["mu"], mu)):
+        is_chosen = item != _find_volume(scene, was) and (item is not None or bool(role))  # another one, in the panel
+        yield from ((text, [] if is_chosen else None) for text in _volume_changes(scene, role, was, item))
+    yield from ((text, []) for text in _setting_changes(old_settings, settings))
 
 
 def _module_changes(
@@ -361,7 +369,9 @@ def _find_volume(scene: bpy.types.Scene, old: Mapping[str, Any] | None) -> bpy.t
         return None
     scene_volumes = volumes.volume_objects(scene)
     matches = [item for item in scene_volumes if item.name == old["name"]]
-    return next(iter(matches or [item for item in scene_volumes if volumes.content_key(item) == old["content"]]), None)
+    return next(
+        iter(matches or [item for item in scene_volumes if volumes.content_key(item) == old.get("content")]), None
+    )
 
 
 def _volume_changes(

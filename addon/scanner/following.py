@@ -168,7 +168,11 @@ def _update_modules(
             for column in formula_columns(type(system)):
                 setattr(module, column.field, float(column.values(system)[m]))
     if changed:
-        pinholes.write_readouts(system, [cameras_[m].mphdrr_module for m in changed], changed, scanner)
+        try:
+            pinholes.write_readouts(system, [cameras_[m].mphdrr_module for m in changed], changed, scanner)
+        except InputError as error:  # a driver or a script may have set the crystals' blur to NaN
+            for m in changed:
+                cameras_[m].mphdrr_module.problem = str(error)
     if isinstance(system, Scanner):
         # Even where nothing has changed: an undo may have restored the values and not the meshes.
         _rebuild(system, cameras_, parts, scanner)

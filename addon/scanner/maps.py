@@ -7,7 +7,7 @@ import bpy
 
 from ...core import Grid, Progress, memory
 from ...core.physics.maps import MAPS, within_roi
-from ..blender import choices, jobs, storage
+from ..blender import choices, ids, jobs, storage
 from ..volumes import slices, volume_materials, volumes
 from ..volumes.stored_volumes import StoredVolume, store_volume
 from . import scanner
@@ -66,7 +66,7 @@ def map_job(
             slices.add_slices(item)
         return f"{name}: {low:.4g} to {high:.4g} {unit}".removesuffix(" 1")
 
-    return jobs.Job(f"{name} of {len(system)} modules", work, finish)
+    return jobs.Job(f"{name} of {ids.counted(len(system), 'module')}", work, finish)
 
 
 mapping = map_job  # the name in version 0.2.0, for scripts

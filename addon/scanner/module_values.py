@@ -209,9 +209,10 @@ def _current_poses(
 def _aimed_poses(kind: ScannerType, poses: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
     """Return the isocentre-aimed poses (M, 4, 4) at the positions of `poses`, and a mask (M,) of modules already aimed.
 
-    A rolled module is not aimed. Kinds without aiming, and modules at the isocentre, are taken as aimed.
+    A rolled module is not aimed. Kinds without aiming, and modules at the isocentre or nowhere (NaN), are taken as aimed.
     """
-    aims, aimed, is_away = poses.copy(), np.ones(len(poses), bool), np.any(poses[:, :3, 3], axis=1)
+    aims, aimed = poses.copy(), np.ones(len(poses), bool)
+    is_away = np.any(poses[:, :3, 3], axis=1) & np.isfinite(poses).all(axis=(1, 2))
     if (away_aims := kind.aimed(poses[is_away, :3, 3])) is not None:
         aims[is_away], aimed[is_away] = away_aims, np.abs(poses[is_away] - away_aims).max(axis=(1, 2)) <= _AIM_ERROR
     return aims, aimed

@@ -14,7 +14,7 @@ from ...core.errors import InputError, warn
 from ...core.exchange import FORMATS, write_geometry
 from ...core.geometry.scanner import Detector, Scanner, first_true
 from ...core.progress import Progress, stages_of
-from ..blender import decimals, jobs, storage
+from ..blender import decimals, ids, jobs, storage
 from . import module_values, pinholes, scanner
 
 WORKBOOK_SUFFIXES = (".xlsx", ".xlsm")
@@ -49,7 +49,7 @@ def export_workbook_job(collection: bpy.types.Collection, path: Path, use_templa
         """Store that the scene's scanner is that of the workbook, and return the line to report."""
         if (collection := bpy.data.collections.get(name)) is not None:
             scanner.store_saved_state(collection, written)
-        return f"Wrote {len(written)} modules of {name!r} to {path}"
+        return f"Wrote {ids.counted(len(written), 'module')} of {name!r} to {path}"
 
     return jobs.Job("Exporting the workbook", work, finish)
 
@@ -81,7 +81,9 @@ def export_program_job(
         stages_of(progress)("writing the file")
         write_geometry(system, path, format, views=views, **arguments)
 
-    return jobs.Job("Exporting the geometry", work, lambda _: f"Wrote {len(system)} modules of {name!r} to {path}")
+    return jobs.Job(
+        "Exporting the geometry", work, lambda _: f"Wrote {ids.counted(len(system), 'module')} of {name!r} to {path}"
+    )
 
 
 def _template_workbook(collection: bpy.types.Collection) -> Path | None:

@@ -111,7 +111,7 @@ def losses(collection: bpy.types.Collection) -> list[str]:
             result.append(f"{modules_text(numbers)} {description}")
     n_missing = collection.mphdrr_scanner.n_modules - sum(not o.mphdrr_module.added for o in cameras_)
     if n_missing > 0:
-        result.append(f"{n_missing} module{'s' * (n_missing > 1)} deleted or moved out")
+        result.append(f"{ids.counted(n_missing, 'module')} deleted or moved out")
     if collection.mphdrr_scanner.design and not collection.mphdrr_scanner.workbook:
         result.append("a design that no workbook has")
     names = [o.name for o in user_objects] + [c.name for c in _user_collections(collection)]

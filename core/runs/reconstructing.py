@@ -11,6 +11,7 @@ from ..arrays import Array, Floats32
 from ..errors import InputError, warn
 from ..geometry.grid import Grid
 from ..geometry.system import PinholeSystem
+from ..geometry.views import Views
 from ..memory import require
 from ..models.emission_warnings import map_warnings
 from ..models.photon_lines import Mu
@@ -233,7 +234,7 @@ def reconstruction_grid(run: ProjectionRun, recipe: Recipe, method: Method | Non
     """Return the grid of a recipe's reconstruction: by default the method's, or a cube around the run's ROI.
 
     The cube has 64 to 128 voxels along each side, so that a voxel is at most half of the smallest rod of the run's phantom,
-    or half of the finest resolution at the isocentre if there are no rods.
+    or half of the finest resolution at the isocentre if there are no rods; but no voxel is finer than half a pixel there.
     """
     is_given = any(f"reconstruction.{name}" in recipe.given for name in ("voxels", "spacing", "center"))
     if method is not None and method.grid is not None and not is_given:
@@ -241,7 +242,8 @@ def reconstruction_grid(run: ProjectionRun, recipe: Recipe, method: Method | Non
     side, spacing = 2 * run.system.region_radius(), recipe["reconstruction.spacing"]
     voxels = recipe["reconstruction.voxels"] or _FEWEST
     if "reconstruction.voxels" not in recipe.given and spacing is None:
-        voxels = int(np.clip(np.ceil(2 * side / _smallest_detail(run)), _FEWEST, _MOST))
+        wanted = np.clip(np.ceil(2 * side / _smallest_detail(run)), _FEWEST, _MOST)
+        voxels = max(1, int(min(wanted, 2 * side // _pixel_at_isocentre(run.views))))
     n_x, n_y, n_z = np.broadcast_to(voxels, 3).tolist()
     spacing = spacing or side / np.array([n_x, n_y, n_z])
     return Grid.centered((n_x, n_y, n_z), np.broadcast_to(spacing, 3), recipe["reconstruction.center"])
@@ -251,6 +253,12 @@ def voxels_text(grid: Grid) -> str:
     """Return a grid's voxels in words: "64 x 64 x 64 voxels of 1.5 mm"."""
     sizes = list(dict.fromkeys(f"{size:.3g}" for size in grid.spacing))
     return f"{' x '.join(map(str, grid.shape))} voxels of {' x '.join(sizes)} mm"
+
+
+def _pixel_at_isocentre(views: Views) -> float:
+    """Return the smallest side of a pixel, as it is seen at the isocentre, mm."""
+    steps = np.linalg.norm([views.u_steps, views.v_steps], axis=2)
+    return float((steps * np.abs(views.projection_matrices()[:, 2, 3])).min())
 
 
 def _smallest_detail(run: ProjectionRun) -> float:
@@ -335,13 +343,12 @@ def inverse_crime_notes(run: ProjectionRun, grid: Grid, model: Recipe | None = N
     fine, coarse = float(run.volume.grid.spacing.max()), float(grid.spacing.min())
     if 2 * fine > 1.001 * coarse:
         notes.append(
-            f"the run was made from voxels of {fine:.3g} mm: figures of a reconstruction in voxels of {coarse:.3g} mm "
-            f"flatter, unless its voxels are {coarse / 2:.3g} mm or less"
+            f"scores look better than they are: the phantom's voxels ({fine:.3g} mm) should be {coarse / 2:.3g} mm or less"
         )
     points, modelled = (r["model.aperture_points"] for r in (recipe, model or recipe))
     if None not in (points, modelled) and 1 < points <= modelled:
         notes.append(
-            f"the run was made with {points} points of the hole: figures of a reconstruction whose model has as many "
-            "flatter, unless the run has more points"
+            f"scores look better than they are: the run has {points} points of the hole, and should have more than the "
+            f"reconstruction's {modelled}"
         )
     return notes

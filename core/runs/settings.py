@@ -258,7 +258,8 @@ _DECLARED = (
             words={name: (method.label, method.text) for name, method in METHODS.items()}),
     *(_ARGUMENTS.pop(name) for name in ("iterations", "subsets")),
     Setting("reconstruction.voxels", int, None, "Voxels along x y z, or one number for all",
-            "voxels are of half the smallest rod, or of half the resolution, if 64 to 128 of them cover the ROI",
+            "voxels are of half the smallest rod, or of half the resolution, if 64 to 128 of them cover the ROI; but not "
+            "finer than half a pixel at the isocentre",
             least=1, sizes=(1, 3)),
     Setting("reconstruction.spacing", float, None, "Voxel size, one or three", "the voxels cover the ROI", unit="mm",
             above=0, slider=10, sizes=(1, 3), label="Voxel Size (mm)"),

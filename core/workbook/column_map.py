@@ -97,7 +97,8 @@ class ColumnMap:
             if table_of.get(name) != _key(0):
                 has = f"{table_of[name]} has {name}" if name in table_of else f"{_key(0)} has no column {name}"
                 faults.append(f"{has}, expected {', '.join(leading)} in the first table")
-        faults += [f"no table has a column {name}" for name in definitions.needed if name not in {*table_of, *leading}]
+        if missing := [name for name in definitions.needed if name not in {*table_of, *leading}]:
+            faults.append(f"no table has {'a column' if len(missing) == 1 else 'the columns'} {', '.join(missing)}")
         # Tables with common rows may share a column only if it has the modules' numbers.
         uses_of_column: dict[tuple[str, str], list[tuple[set[int], str]]] = {}
         for i, table in enumerate(self.tables):
@@ -183,13 +184,16 @@ def _find_table_faults(table: MappedTable, i: int, definitions: ColumnTable) -> 
             yield f"{_key(i)}: skip_rows has {row}, expected rows between {table.first_row} and {table.last_row}"
     if not table.columns:
         yield f"{_key(i)} has no columns"
+    alike: dict[tuple[str, tuple[str, ...]], list[str]] = {}  # unit and the expected ones -> quantities
     for c in table.columns:
         if (definition := definitions.get(c.quantity)) is None:
             yield f"{_key(i, c.quantity)}: no such quantity, expected {', '.join(definitions)}"
         elif c.unit not in definition.units:
-            yield f"{_key(i, c.quantity)}: unit {c.unit!r}, expected {', '.join(filter(None, definition.units)) or 'none'}"
+            alike.setdefault((c.unit, tuple(definition.units)), []).append(c.quantity)
         if not _is_column_letters(c.column):
             yield f"{_key(i, c.quantity)}: column {c.column!r}, expected letters such as B"
+    for (unit, expected), names in alike.items():
+        yield f"{_key(i, ', '.join(names))}: unit {unit!r}, expected {', '.join(filter(None, expected)) or 'none'}"
     if table.number is not None and not _is_column_letters(table.number):
         yield f"{_key(i)}: number {table.number!r}, expected a column's letters such as A"
     if i == 0 and table.rows is not None:

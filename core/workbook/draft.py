@@ -5,14 +5,14 @@ from dataclasses import dataclass, replace
 
 from ..errors import InputError
 from ..files import AnyPath
-from ..geometry.columns import ColumnTable
+from ..geometry.columns import LENGTH_UNITS, ColumnTable
 from ..recording import recorded_warnings
 from ..scanner_kinds import scanner_kind
 from .book import HEADING_ROWS, Book, OutdatedValue, Sheet, shorten
 from .calculation import UncomputedValue
 from .column_map import ColumnMap, MappedColumn, MappedTable, RowMatching
 from .headed_table import HeadedTable
-from .headings import get_vocabulary, is_number_heading
+from .headings import get_vocabulary, is_number_heading, quote_text, units_mentioned
 from .recognition import headed_layout, recognize_tables
 
 
@@ -43,7 +43,9 @@ def draft_column_map(path: AnyPath, kind: str = "pinhole") -> ColumnMapDraft:
         with recorded_warnings():  # they are given when the workbook is read
             headed_layout(book, scanner)
     except InputError as error:
-        questions, is_certain = questions or [str(error).removeprefix(f"{book.path.name}: ")], False
+        is_certain = False
+        if not questions and not recognized.missing:
+            questions = [str(error).removeprefix(f"{book.path.name}: ")]
     optional = recognized.tables.keys() - set(definitions.needed) if is_certain else ()
     incomplete = {name for name in optional if _has_gaps(recognized.tables[name], name)}
     table_of = {name: table for name, table in recognized.tables.items() if name not in incomplete}
@@ -54,7 +56,12 @@ def draft_column_map(path: AnyPath, kind: str = "pinhole") -> ColumnMapDraft:
             questions.append(f"{name} stands in some rows only and is left out here: {used} is then used for all")
     missing = [name for name in definitions.typed if name not in recognized.tables and not definitions[name].is_text]
     if not is_certain:
-        _add_guesses(tables, recognized.sheets, definitions, missing)
+        guesses = _add_guesses(tables, recognized.sheets, definitions, missing)
+        # A doubt names the heading already where its table is recognized.
+        guesses = {name: text for name, text in guesses.items() if not any(text in doubt for doubt in questions)}
+        if guesses:
+            questions.append(f"guessed by the headings: {', '.join(map(' '.join, guesses.items()))}")
+        questions += _propose_units(tables, recognized.sheets, definitions)
     if missing and not tables:
         tables = [MappedTable(next(iter(book.sheets), "Coordinates"), 2, 2, ())]
     leading = {definitions.leading, *definitions.position}
@@ -110,8 +117,14 @@ def _mapped_table(
 
 def _add_guesses(
     tables: list[MappedTable], sheets: dict[str, Sheet], definitions: ColumnTable, missing: list[str]
-) -> None:
-    """Add columns whose headings may name a missing column, to the table with the same rows if there is one."""
+) -> dict[str, str]:
+    """Add columns whose headings may name a missing column, to the table with the same rows if there is one.
+
+    Return the headings, in quotes, by name of the column.
+    """
+    from openpyxl.utils import column_index_from_string
+
+    guessed: dict[str, str] = {}
     used_columns = {(table.sheet, c.column) for table in tables for c in table.columns}
     for name in missing:
         guesses = (guess for sheet in sheets.values() for guess in _guess_columns(sheet, definitions, name))
@@ -119,12 +132,28 @@ def _add_guesses(
         if guess is None:
             continue
         used_columns.add((guess.sheet, guess.columns[0].column))
+        heading = sheets[guess.sheet].texts[guess.header_row or 0, column_index_from_string(guess.columns[0].column)]
+        guessed[name] = quote_text(heading)
         row_range = (guess.sheet, guess.first_row, guess.last_row)
         matches = [i for i, table in enumerate(tables) if (table.sheet, table.first_row, table.last_row) == row_range]
         if matches:
             tables[matches[0]] = replace(tables[matches[0]], columns=tables[matches[0]].columns + guess.columns)
         else:
             tables.append(guess)
+    return guessed
+
+
+def _propose_units(tables: list[MappedTable], sheets: dict[str, Sheet], definitions: ColumnTable) -> Iterator[str]:
+    """Fill in the unit of lengths that have none, if sheet's name and titles mention one; yield what is to be checked."""
+    for i, table in enumerate(tables):
+        titles = [text for (row, _), text in sheets[table.sheet].texts.items() if row < (table.header_row or 0)]
+        units = {unit for text in (table.sheet.replace("_", " "), *titles) for unit in units_mentioned(text)}
+        names = [c.quantity for c in table.columns if not c.unit and definitions[c.quantity].kind == "length"]
+        if names and len(units) == 1 and units <= LENGTH_UNITS.keys():
+            (unit,) = units
+            columns = tuple(replace(c, unit=unit) if c.quantity in names else c for c in table.columns)
+            tables[i] = replace(table, columns=columns)
+            yield f"{unit}, of the title of sheet {table.sheet}, is proposed for {', '.join(names)}"
 
 
 def _guess_columns(sheet: Sheet, definitions: ColumnTable, name: str) -> Iterator[MappedTable]:

@@ -35,7 +35,9 @@ class RecognizedTables(NamedTuple):
     tables: dict[str, HeadedTable]
     """Name of the scanner's column -> the table that holds it."""
     doubts: list[str]
-    """Reasons, as texts of messages, why the tables may not be what is meant; also columns that are missing."""
+    """Reasons, as texts of messages, why the tables may not be what is meant."""
+    missing: list[str]
+    """A text of a message for each column that no sheet has."""
 
 
 def recognize_tables(book: Book, scanner: type[Scanner]) -> RecognizedTables:
@@ -64,7 +66,7 @@ def recognize_tables(book: Book, scanner: type[Scanner]) -> RecognizedTables:
     for table in dict.fromkeys(tables.values()):
         names = {*definitions.typed, *(name for name, holder in tables.items() if holder is table)}
         doubts += _find_doubts(table, names)
-    return RecognizedTables(sheets, tables, doubts + missing)
+    return RecognizedTables(sheets, tables, doubts, missing)
 
 
 def _find_visible_twins(book: Book, scanner: type[Scanner], modules: HeadedTable) -> Iterator[str]:
@@ -92,7 +94,7 @@ def _describe_missing(book: Book, sheets: dict[str, Sheet], definitions: ColumnT
 def headed_layout(book: Book, scanner: type[Scanner]) -> WorkbookLayout:
     """Return the layout that a workbook's headings describe; raise `InputError` if there is any doubt."""
     recognized = recognize_tables(book, scanner)
-    for doubt in recognized.doubts:
+    for doubt in (*recognized.doubts, *recognized.missing):
         raise _unclear_error(book, doubt)
     modules = recognized.tables[scanner.columns.leading]
     for table in dict.fromkeys(recognized.tables.values()):

@@ -74,9 +74,9 @@ def _emptied(folder: Path) -> Path:
 
 @pytest.fixture(scope="session")
 def extension_zip() -> Path:
-    """Return the built zip for Linux; it must be of this tree."""
+    """Return the built zip for Linux and the real Blender; it must be of this tree."""
     version = tomllib.loads((ROOT / "blender_manifest.toml").read_text())["version"]
-    path = ROOT / "dist" / f"mphdrr-{version}-linux_x64.zip"
+    path = ROOT / "dist" / f"mphdrr-{version}-linux_x64-python_3.14.zip"  # the real Blender is a distribution's
     if not path.is_file():
         pytest.fail(f"{path.name} is not in dist/; run: make dist PLATFORM=linux-x64")
     with zipfile.ZipFile(path) as archive:

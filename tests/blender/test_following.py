@@ -223,3 +223,18 @@ def test_a_run_belongs_to_its_scanner(scene, a_and_b, box):
     bpy.data.collections.remove(a)
     with pytest.raises(InputError, match="not in the scene"):
         tiles.pick_module(context, *place)
+
+
+@pytest.mark.parametrize("number", [np.nan, np.inf, 1e30])
+def test_numbers_that_no_one_can_type_end_in_a_line(ring, capfd, number):
+    camera = scanner.module(ring, 5)
+    for owner, name in ((camera, "location"), (camera, "rotation_euler"), (ring.mphdrr_scanner, "intrinsic_fwhm")):
+        before = np.array(getattr(owner, name)).tolist()
+        setattr(owner, name, (number,) * 3 if isinstance(before, list) else number)
+        update()
+        if not np.isfinite(getattr(owner, name)).all():
+            assert "is not a finite number" in camera.mphdrr_module.problem, name
+        setattr(owner, name, before)
+        update()
+        assert not camera.mphdrr_module.problem, name
+    assert "Traceback" not in capfd.readouterr().err

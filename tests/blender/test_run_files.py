@@ -47,7 +47,7 @@ def test_counts_become_the_shown_run(ring, ring_system, counts, scene, tmp_path)
     assert (run.recipe["model.isotope"], run.recipe["model.time"]) == ("Tc-99m", 60.0)
     for m, number in enumerate(run.system.numbers):
         assert np.array_equal(images.projection_array(bpy.data.images[ids.projection_name(number, 8)]), counts[7 - m])
-    assert len(settings.runs) == 1 and settings.runs[0].name == "counts.npy, SPECT Counts"
+    assert len(settings.runs) == 1 and settings.runs[0].name == "SPECT Counts, 6 × 6, counts.npy"
     assert runs.measured_text(scene).startswith("counts.npy, 60 s, frames back-v.") and not runs.changes(scene)
     assert runs.volume_to_render(scene) == ""
     bpy.data.objects["Module 03"].location.x += 1.0

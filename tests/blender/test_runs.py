@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from types import SimpleNamespace
 from unittest.mock import MagicMock
 
 import bpy
@@ -83,6 +84,9 @@ EDITS = {
     "seed none, now 4": (lambda: set_(noise=True, seed=4), lambda: set_(noise=False)),
 }  # fmt: skip
 
+USUAL = "SPECT Counts, 1 s, 12 × 10, Derenzo"
+PANEL = ("time", "isotope", "model ", "pixels", "modules all, now", "seed")
+
 
 @pytest.mark.parametrize(
     "said", [pytest.param(said, marks=() if i % 2 == 0 else pytest.mark.long) for i, said in enumerate(EDITS)]
@@ -95,6 +99,7 @@ def test_whatever_changes_is_said_until_it_goes_back(render, scene, said):
     edit()
     update()
     assert runs.changes(scene) == [said]
+    assert runs.has_scene_changed(scene) != said.startswith(PANEL), "a setting of the panel alone marks no tile"
     if back is not None:
         back()
         update()
@@ -143,7 +148,7 @@ def test_the_list_keeps_two_and_what_is_renamed_or_pinned(render, scene):
     render("the first sight")
     render().keep = True
     second = storage.absolute(listed[0].file)
-    assert [item.name for item in listed] == ["Derenzo, SPECT Counts", "the first sight", "Derenzo, SPECT Counts 2"]
+    assert [item.name for item in listed] == [USUAL, "the first sight", f"{USUAL} 2"]
     for _ in range(3):
         render()
     assert [item.is_kept for item in listed] == [True, True, False, False]
@@ -152,6 +157,8 @@ def test_the_list_keeps_two_and_what_is_renamed_or_pinned(render, scene):
     assert len(set(files)) == 4 and sorted(storage.folder().glob("*.h5")) == sorted(files)
     assert len({item.name for item in listed}) == 4 and runs.shown_run(scene) == listed[3]
     assert "KiB" in runs.file_size_text(listed)
+    removing = bpy.types.MPHDRR_OT_remove_run
+    assert "KiB" in removing.description(bpy.context, SimpleNamespace(index=1)), "its tooltip"
 
 
 def test_choosing_a_run_shows_its_images_and_removing_it_removes_its_file(render, scene):
@@ -183,7 +190,7 @@ def test_two_runs_survive_save_and_reopen(render, scene, tmp_path):
     bpy.ops.wm.open_mainfile(filepath=str(moved / "study.blend"))
     scene = bpy.context.scene
     settings = scene.mphdrr_projections
-    assert [item.name for item in settings.runs] == ["one", "Derenzo, SPECT Counts"]
+    assert [item.name for item in settings.runs] == ["one", USUAL]
     assert all(item.file.startswith("//study_mphdrr/") and item.is_saved for item in settings.runs)
     for item, expected in zip(settings.runs, before, strict=True):
         assert np.array_equal(array_of(item), expected)
@@ -279,5 +286,6 @@ def test_a_volume_that_is_not_in_the_panel_is_found_again(render, scene):
     assert runs.changes(scene) == [] and runs.volume_to_render(scene) == "Derenzo"
     set_(volume=bpy.data.objects["Other"])
     assert runs.changes(scene) == ["volume Derenzo, now Other"] and runs.volume_to_render(scene) == ""
+    assert not runs.has_scene_changed(scene)
     assert bpy.ops.mphdrr.render_projections() == {"FINISHED"}
     assert runs.changes(scene) == [] and rendering.run_file_path(scene.mphdrr_projections.run_file)

@@ -319,9 +319,27 @@ def test_a_draft_asks_for_what_was_not_understood(tmp_path):
     for question in (
         "Coordinates!B2 is headed 'x1 (dm)', which is not",
         "no table has a column Ld",
-        "table 1.x1: unit ''",
+        "table 1.y1, z1, l, x1: unit ''",
+        "table 2.d, R, Td: unit ''",
     ):
-        assert any(text.startswith(question) for text in draft.questions)
+        assert sum(text.startswith(question) for text in draft.questions) == 1, draft.questions
+
+
+def test_a_draft_asks_each_thing_once_and_proposes_the_titles_unit(tmp_path):
+    book = openpyxl.Workbook()
+    book.active.title = "Geometry (cm)"
+    for row in (["Hole", "X pos", "Y pos", "Z pos", "Det size"], [1, 10, 0, 1, 5], [2, 0, 10, 2, 5]):
+        book.active.append(row)
+    draft = mph.draft_column_map(saved(book, tmp_path))
+    (table,) = draft.columns.tables
+    assert {(c.quantity, c.column, c.unit) for c in table.columns} == {
+        ("x1", "B", "cm"), ("y1", "C", "cm"), ("z1", "D", "cm"), ("Ld", "E", "cm"),
+    }  # fmt: skip
+    assert draft.questions == (
+        "guessed by the headings: x1 'X pos', y1 'Y pos', z1 'Z pos', Ld 'Det size'",
+        "cm, of the title of sheet Geometry (cm), is proposed for x1, y1, z1, Ld",
+        "no table has the columns d, R, Td",
+    )
 
 
 def test_a_draft_of_a_workbook_of_which_nothing_is_understood_can_be_written(tmp_path):

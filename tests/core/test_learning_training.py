@@ -179,7 +179,7 @@ def test_events_that_cannot_be_learned_from_and_a_full_disk_are_refused(recipe, 
 
 def test_truth_from_coarse_voxels_is_doubted(recipe, tmp_path):
     recipe = changed(recipe, "spacing = 12.0", "spacing = 8.0")
-    with pytest.warns(mph.InputWarning, match="flatter"):
+    with pytest.warns(mph.InputWarning, match="scores look better"):
         prepare_samples(Source(recipe), tmp_path, ["test"])
 
 

@@ -163,7 +163,7 @@ def test_that_a_score_flatters_stays_with_it(system, tmp_path, command):
         found = mph.reconstruct_run(run, how)
     flatters = found.settings["flatters"]
     assert [str(each.message) for each in caught] == flatters and len(flatters) == 2
-    assert re.search("made from voxels of 4 mm.*3 mm or less", flatters[0]) and "7 points of the hole" in flatters[1]
+    assert re.search(r"voxels \(4 mm\) should be 3 mm or less", flatters[0]) and "7 points of the hole" in flatters[1]
     mph.write_volume(found.volume, tmp_path / "v.npz")
     arguments = ["score", tmp_path / "v.npz", "--truth", tmp_path / "run.npz"]
     assert json.loads(command(*arguments, "--json").out)["notes"] == flatters

@@ -16,11 +16,10 @@ from ..reconstruction.least_squares import sirt
 from ..validation import freeze, instance, real_array, whole_number
 from ..volumes.volume import LINE_INTEGRALS, Volume, require_quantity
 
-SH=1/12
 _LEVELS = (4, 2, 1)
 """Block sizes, pixels, by which images are compared: coarse ones come first, to find motion that is larger than details."""
-_MAX_DISTANCE = 1.0
-"""Distance in voxels from the motion at which derivatives were computed, beyond which they are computed anew."""
+_MAX_DISTANCE = 2.0
+"""Distance in half voxels from the motion at which derivatives were computed, beyond which they are computed anew."""
 _SMOOTHING = 2.0
 """Standard deviation, pixels, of the Gaussian that smooths the derivatives by which residuals are weighted.
 
@@ -29,9 +28,11 @@ Details that voxels cannot hold then say little of the motion.
 _RAYS = 2
 """Rays per row and column of a pixel by which images are compared without blocks: one tells little of the pixel's mean."""
 _REGIONS = 8
-"""Regions per row and column of an image over which the correlation of residuals is taken into account."""
-_SETTLED, _COARSE, _EXACT = 0.1, 0.02, 1e-4
-"""Largest final step: as a share of the standard deviations; in voxels and pixels of a block; in voxels, without blocks."""
+"""Regions per row and column of an image, within which residuals may be correlated, as those of voxels' errors are."""
+_UNSHARPNESS = 1 / 12
+"""Blur of voxels, as a share of the second differences: the means in the reference blur by half of it, rays by half."""
+_SETTLED, _COARSE, _EXACT = 0.1, 0.04, 2e-4
+"""Largest final step: as a share of the standard deviations; in half voxels, times a block's pixels, or without blocks."""
 _MIN_VARIANCE = 1e-12
 """Variance of line integrals by rounding, the least that is assumed."""
 _MAX_CONDITION = 1e12
@@ -51,8 +52,8 @@ class Motion:
     center : array (3,)
         Centre of the reference before the motion, world mm.
     covariance : array (6, 6)
-        Covariance of shift and rotation, mm and rad, by the images' noise, enlarged where the residuals exceed noise. It
-        does not contain errors of the reference.
+        Covariance of shift and rotation, mm and rad, as the residuals of the images tell it, which contain noise and voxels'
+        errors. Errors of the reference that its images do not show, such as its own motion, are not contained.
     settled : bool
         Whether the last step was small, so that the iterations converged.
     """
@@ -77,7 +78,7 @@ class MotionFinder:
     """Finds the motions of a body since a reference from successive sets of images, for motion as it happens.
 
     Images are nearly linear in a motion of less than a voxel, so the derivatives of the set before are kept as long as they
-    are valid. Then a motion takes two or three projections, else 14 more for each block size. Parameters are those of
+    are valid. Then a motion takes two or three projections, else eight more for each block size. Parameters are those of
     `find_motion`.
     """
 
@@ -90,12 +91,12 @@ class MotionFinder:
         self.reference, self.views, self._backend = reference, views, backend
         self._center = reference.grid.center
         self._photons = None if photons is None else real_array(photons, "photons", None)
-        step = reference.grid.spacing.min()
+        step = reference.grid.spacing.min() / 2
         radius = np.linalg.norm(reference.grid.corners()[0] - self._center) / 2
-        self._steps = np.array([step] * 3 + [step / radius] * 3)  # mm and rad that move the body by about a voxel
+        self._steps = np.array([step] * 3 + [step / radius] * 3)  # mm and rad that move the body by about half a voxel
         array = np.asarray(reference.array, np.float32)
         blur = _second_differences(array)
-        self._volumes = array - SH * blur, blur
+        self._volumes = array - _UNSHARPNESS * blur, blur
         self._derivatives_at: dict[int, tuple[Floats, Floats, Floats]] = {}  # by block size; they begin with the motion
 
     def __call__(self, images: ArrayLike, start: Motion | None = None, iterations: int = 10) -> Motion:
@@ -109,7 +110,8 @@ class MotionFinder:
             for _ in range(whole_number(iterations, "iterations")):
                 derivatives, smoothed = self._derivatives(motion, level)
                 rays = _RAYS if level == 1 else 1
-                expected = _block_means(self._project(motion, level / rays), rays)
+                expected = self._project(motion, level / rays)
+                expected = -np.log(_block_means(np.exp(-expected), rays))  # pixels count the mean transmission
                 if photons is None:
                     residual, variances = (blocks - expected).ravel(), np.zeros(blocks.size)
                 else:  # of transmitted photons, whose noise has no mean and a variance that does not depend on it
@@ -145,9 +147,9 @@ class MotionFinder:
         """
         computed_at, *derivatives = self._derivatives_at.get(level, (np.full(6, np.inf),) * 3)
         if np.abs((motion - computed_at) / self._steps).max() > _MAX_DISTANCE:
-            ends = [[self._project(motion + sign * step, level) for sign in (1, -1)] for step in np.diag(self._steps)]
-            slopes = np.gradient(self._project(motion, level), axis=(1, 2))
-            images = [(upper - lower) / 2 for upper, lower in ends]
+            base = self._project(motion, level)
+            slopes = np.gradient(base, axis=(1, 2))
+            images = [self._project(motion + step, level) - base for step in np.diag(self._steps)]
             images += [self._project(motion, level, self._volumes[1]), slopes[0] ** 2 + slopes[1] ** 2]
             along_v, along_u = (gaussian_blur(n, _SMOOTHING) for n in images[0].shape[1:])
             derivatives = [np.reshape(array, (len(images), -1)) for array in (images, along_v @ images @ along_u.T)]
@@ -162,7 +164,7 @@ class MotionFinder:
             raise InputError(f"photons: expected more than 0, one number or images of {images.shape}")
         return np.broadcast_to(self._photons, images.shape)
 
-    def _project(self, motion: Floats, level: int, array: Floats32 | None = None) -> Floats:
+    def _project(self, motion: Floats, level: float, array: Floats32 | None = None) -> Floats:
         """Return images (M, n_v, n_u) of the moved reference, or another array, with pixels `level` times as large."""
         grid = _moved_grid(self.reference.grid, _pose(motion, self._center))
         A = Projector(grid, _coarse_views(self.views, level), backend=self._backend)
@@ -249,8 +251,8 @@ def _moved_grid(grid: Grid, pose: Floats) -> Grid:
     return Grid(grid.shape, pose @ grid.affine)
 
 
-def _coarse_views(views: Views, level: int) -> Views:
-    """Return views of the same size with pixels `level` times as large."""
+def _coarse_views(views: Views, level: float) -> Views:
+    """Return views of the same size with pixels `level` times as large, half as large if it is 1 / 2."""
     size = tuple(round(n / level) for n in views.shape)
     return replace(views, u_steps=level * views.u_steps, v_steps=level * views.v_steps, shape=size)
 

@@ -18,8 +18,8 @@ from ..volumes.volume import LINE_INTEGRALS, Volume, require_quantity
 
 _LEVELS = (4, 2, 1)
 """Block sizes, pixels, by which images are compared: coarse ones come first, to find motion that is larger than details."""
-_MAX_DISTANCE = 2.0
-"""Distance in half voxels from the motion at which derivatives were computed, beyond which they are computed anew."""
+_MAX_DISTANCE = 1.0
+"""Distance in voxels from the motion at which derivatives were computed, beyond which they are computed anew."""
 _SMOOTHING = 2.0
 """Standard deviation, pixels, of the Gaussian that smooths the derivatives by which residuals are weighted.
 
@@ -31,8 +31,8 @@ _REGIONS = 8
 """Regions per row and column of an image, within which residuals may be correlated, as those of voxels' errors are."""
 _UNSHARPNESS = 1 / 12
 """Blur of voxels, as a share of the second differences: the means in the reference blur by half of it, rays by half."""
-_SETTLED, _COARSE, _EXACT = 0.1, 0.04, 2e-4
-"""Largest final step: as a share of the standard deviations; in half voxels, times a block's pixels, or without blocks."""
+_SETTLED, _COARSE, _EXACT = 0.1, 0.02, 1e-4
+"""Largest final step: as a share of the standard deviations; in voxels and pixels of a block; in voxels, without blocks."""
 _MIN_VARIANCE = 1e-12
 """Variance of line integrals by rounding, the least that is assumed."""
 _MAX_CONDITION = 1e12
@@ -78,7 +78,7 @@ class MotionFinder:
     """Finds the motions of a body since a reference from successive sets of images, for motion as it happens.
 
     Images are nearly linear in a motion of less than a voxel, so the derivatives of the set before are kept as long as they
-    are valid. Then a motion takes two or three projections, else eight more for each block size. Parameters are those of
+    are valid. Then a motion takes two or three projections, else 14 more for each block size. Parameters are those of
     `find_motion`.
     """
 
@@ -91,9 +91,9 @@ class MotionFinder:
         self.reference, self.views, self._backend = reference, views, backend
         self._center = reference.grid.center
         self._photons = None if photons is None else real_array(photons, "photons", None)
-        step = reference.grid.spacing.min() / 2
+        step = reference.grid.spacing.min()
         radius = np.linalg.norm(reference.grid.corners()[0] - self._center) / 2
-        self._steps = np.array([step] * 3 + [step / radius] * 3)  # mm and rad that move the body by about half a voxel
+        self._steps = np.array([step] * 3 + [step / radius] * 3)  # mm and rad that move the body by about a voxel
         array = np.asarray(reference.array, np.float32)
         blur = _second_differences(array)
         self._volumes = array - _UNSHARPNESS * blur, blur
@@ -147,9 +147,9 @@ class MotionFinder:
         """
         computed_at, *derivatives = self._derivatives_at.get(level, (np.full(6, np.inf),) * 3)
         if np.abs((motion - computed_at) / self._steps).max() > _MAX_DISTANCE:
-            base = self._project(motion, level)
-            slopes = np.gradient(base, axis=(1, 2))
-            images = [self._project(motion + step, level) - base for step in np.diag(self._steps)]
+            ends = [[self._project(motion + sign * step, level) for sign in (1, -1)] for step in np.diag(self._steps)]
+            slopes = np.gradient(self._project(motion, level), axis=(1, 2))
+            images = [(upper - lower) / 2 for upper, lower in ends]
             images += [self._project(motion, level, self._volumes[1]), slopes[0] ** 2 + slopes[1] ** 2]
             along_v, along_u = (gaussian_blur(n, _SMOOTHING) for n in images[0].shape[1:])
             derivatives = [np.reshape(array, (len(images), -1)) for array in (images, along_v @ images @ along_u.T)]

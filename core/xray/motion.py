@@ -33,8 +33,6 @@ _UNSHARPNESS = 1 / 12
 """Blur of voxels, as a share of the second differences: the means in the reference blur by half of it, rays by half."""
 _SETTLED, _COARSE, _EXACT = 0.1, 0.02, 1e-4
 """Largest final step: as a share of the standard deviations; in voxels and pixels of a block; in voxels, without blocks."""
-_MIN_VARIANCE = 1e-12
-"""Variance of line integrals by rounding, the least that is assumed."""
 _MAX_CONDITION = 1e12
 """Condition number of the information matrix from which on the images do not determine all six numbers."""
 
@@ -106,28 +104,24 @@ class MotionFinder:
         motion = np.zeros(6) if start is None else np.concatenate([start.shift, start.rotation])
         levels = [level for level in _LEVELS if all(n % level == 0 for n in self.views.shape)]
         for level in levels if start is None else levels[-1:]:
-            blocks, unexplained = _block_means(measured, level), 0.0
+            blocks = _block_means(measured, level)
             for _ in range(whole_number(iterations, "iterations")):
                 derivatives, smoothed = self._derivatives(motion, level)
                 rays = _RAYS if level == 1 else 1
-                expected = self._project(motion, level / rays)
-                expected = -np.log(_block_means(np.exp(-expected), rays))  # pixels count the mean transmission
+                expected = _block_means(self._project(motion, level / rays), rays)
                 if photons is None:
-                    residual, variances = (blocks - expected).ravel(), np.zeros(blocks.size)
+                    residual, weights = (blocks - expected).ravel(), np.ones(blocks.size)
                 else:  # of transmitted photons, whose noise has no mean and a variance that does not depend on it
                     residual = -np.expm1(expected - blocks).ravel()
-                    variances = (np.exp(expected) / _block_means(photons, level)).ravel() / level**2
-                for _ in range(2):  # the second with weights by what the first leaves unexplained
-                    weights = 1 / np.maximum(variances + unexplained, _MIN_VARIANCE)
-                    rows = smoothed * weights
-                    information = rows @ derivatives.T
-                    if not np.linalg.cond(information) < _MAX_CONDITION:
-                        reason = "these images do not show all of a motion"
-                        raise InputError(f"find_motion: {reason}: expected more or other views")
-                    inverse = np.linalg.inv(information)
-                    step = inverse @ (rows @ residual)
-                    rest = residual - step @ derivatives
-                    unexplained = max(0.0, float(np.mean(rest**2 - variances)))
+                    weights = (np.exp(-expected) * _block_means(photons, level)).ravel()
+                rows = smoothed * weights
+                information = rows @ derivatives.T
+                if not np.linalg.cond(information) < _MAX_CONDITION:
+                    reason = "these images do not show all of a motion"
+                    raise InputError(f"find_motion: {reason}: expected more or other views")
+                inverse = np.linalg.inv(information)
+                step = inverse @ (rows @ residual)
+                rest = residual - step @ derivatives
                 motion = motion + self._steps * step[:6]
                 covariance = (inverse @ _scatter(np.reshape(rows * rest, (-1, *blocks.shape))) @ inverse.T)[:6, :6]
                 least = _COARSE * level if level > 1 else _EXACT
@@ -253,7 +247,8 @@ def _moved_grid(grid: Grid, pose: Floats) -> Grid:
 
 def _coarse_views(views: Views, level: float) -> Views:
     """Return views of the same size with pixels `level` times as large, half as large if it is 1 / 2."""
-    size = tuple(round(n / level) for n in views.shape)
+    n_v, n_u = views.shape
+    size = round(n_v / level), round(n_u / level)
     return replace(views, u_steps=level * views.u_steps, v_steps=level * views.v_steps, shape=size)
 
 

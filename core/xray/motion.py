@@ -25,10 +25,14 @@ _SMOOTHING = 2.0
 
 Details that voxels cannot hold then say little of the motion.
 """
+_RAYS = 2
+"""Rays per row and column of a pixel by which images are compared without blocks: one tells little of the pixel's mean."""
+_REGIONS = 8
+"""Regions per row and column of an image, within which residuals may be correlated, as those of voxels' errors are."""
+_UNSHARPNESS = 1 / 12
+"""Blur of voxels, as a share of the second differences: the means in the reference blur by half of it, rays by half."""
 _SETTLED, _COARSE, _EXACT = 0.1, 0.02, 1e-4
 """Largest final step: as a share of the standard deviations; in voxels and pixels of a block; in voxels, without blocks."""
-_MIN_VARIANCE = 1e-12
-"""Variance of line integrals by rounding, the least that is assumed."""
 _MAX_CONDITION = 1e12
 """Condition number of the information matrix from which on the images do not determine all six numbers."""
 
@@ -46,8 +50,8 @@ class Motion:
     center : array (3,)
         Centre of the reference before the motion, world mm.
     covariance : array (6, 6)
-        Covariance of shift and rotation, mm and rad, by the images' noise, enlarged where the residuals exceed noise. It
-        does not contain errors of the reference.
+        Covariance of shift and rotation, mm and rad, as the residuals of the images tell it, which contain noise and voxels'
+        errors. Errors of the reference that its images do not show, such as its own motion, are not contained.
     settled : bool
         Whether the last step was small, so that the iterations converged.
     """
@@ -88,9 +92,9 @@ class MotionFinder:
         step = reference.grid.spacing.min()
         radius = np.linalg.norm(reference.grid.corners()[0] - self._center) / 2
         self._steps = np.array([step] * 3 + [step / radius] * 3)  # mm and rad that move the body by about a voxel
-        finer = _halve_voxels(reference)
-        self._volumes = finer.array, _laplacian(finer.array)
-        self._grid = finer.grid
+        array = np.asarray(reference.array, np.float32)
+        blur = _second_differences(array)
+        self._volumes = array - _UNSHARPNESS * blur, blur
         self._derivatives_at: dict[int, tuple[Floats, Floats, Floats]] = {}  # by block size; they begin with the motion
 
     def __call__(self, images: ArrayLike, start: Motion | None = None, iterations: int = 10) -> Motion:
@@ -100,29 +104,26 @@ class MotionFinder:
         motion = np.zeros(6) if start is None else np.concatenate([start.shift, start.rotation])
         levels = [level for level in _LEVELS if all(n % level == 0 for n in self.views.shape)]
         for level in levels if start is None else levels[-1:]:
-            blocks, unexplained = _block_means(measured, level), 0.0
+            blocks = _block_means(measured, level)
             for _ in range(whole_number(iterations, "iterations")):
                 derivatives, smoothed = self._derivatives(motion, level)
-                expected = self._project(motion, level)
+                rays = _RAYS if level == 1 else 1
+                expected = _block_means(self._project(motion, level / rays), rays)
                 if photons is None:
-                    residual, variances = (blocks - expected).ravel(), np.zeros(blocks.size)
+                    residual, weights = (blocks - expected).ravel(), np.ones(blocks.size)
                 else:  # of transmitted photons, whose noise has no mean and a variance that does not depend on it
                     residual = -np.expm1(expected - blocks).ravel()
-                    variances = (np.exp(expected) / _block_means(photons, level)).ravel() / level**2
-                for _ in range(2):  # the second with weights by what the first leaves unexplained
-                    weights = 1 / np.maximum(variances + unexplained, _MIN_VARIANCE)
-                    rows = smoothed * weights
-                    information = rows @ derivatives.T
-                    if not np.linalg.cond(information) < _MAX_CONDITION:
-                        reason = "these images do not show all of a motion"
-                        raise InputError(f"find_motion: {reason}: expected more or other views")
-                    inverse = np.linalg.inv(information)
-                    step = inverse @ (rows @ residual)
-                    rest = residual - step @ derivatives
-                    unexplained = max(0.0, float(np.mean(rest**2 - variances)))
+                    weights = (np.exp(-expected) * _block_means(photons, level)).ravel()
+                rows = smoothed * weights
+                information = rows @ derivatives.T
+                if not np.linalg.cond(information) < _MAX_CONDITION:
+                    reason = "these images do not show all of a motion"
+                    raise InputError(f"find_motion: {reason}: expected more or other views")
+                inverse = np.linalg.inv(information)
+                step = inverse @ (rows @ residual)
+                rest = residual - step @ derivatives
                 motion = motion + self._steps * step[:6]
-                variance = float(weights @ rest**2) / max(1, rest.size - len(step))
-                covariance = variance * (inverse @ (rows @ smoothed.T) @ inverse.T)[:6, :6]
+                covariance = (inverse @ _scatter(np.reshape(rows * rest, (-1, *blocks.shape))) @ inverse.T)[:6, :6]
                 least = _COARSE * level if level > 1 else _EXACT
                 settled = bool(np.all(np.abs(step[:6]) <= np.maximum(_SETTLED * np.sqrt(np.diag(covariance)), least)))
                 if settled:
@@ -157,9 +158,9 @@ class MotionFinder:
             raise InputError(f"photons: expected more than 0, one number or images of {images.shape}")
         return np.broadcast_to(self._photons, images.shape)
 
-    def _project(self, motion: Floats, level: int, array: Floats32 | None = None) -> Floats:
+    def _project(self, motion: Floats, level: float, array: Floats32 | None = None) -> Floats:
         """Return images (M, n_v, n_u) of the moved reference, or another array, with pixels `level` times as large."""
-        grid = _moved_grid(self._grid, _pose(motion, self._center))
+        grid = _moved_grid(self.reference.grid, _pose(motion, self._center))
         A = Projector(grid, _coarse_views(self.views, level), backend=self._backend)
         return np.asarray(A(self._volumes[0] if array is None else array), float)
 
@@ -244,10 +245,10 @@ def _moved_grid(grid: Grid, pose: Floats) -> Grid:
     return Grid(grid.shape, pose @ grid.affine)
 
 
-def _coarse_views(views: Views, level: int) -> Views:
-    """Return views of the same size with pixels `level` times as large."""
+def _coarse_views(views: Views, level: float) -> Views:
+    """Return views of the same size with pixels `level` times as large, half as large if it is 1 / 2."""
     n_v, n_u = views.shape
-    size = n_v // level, n_u // level
+    size = round(n_v / level), round(n_u / level)
     return replace(views, u_steps=level * views.u_steps, v_steps=level * views.v_steps, shape=size)
 
 
@@ -257,22 +258,25 @@ def _block_means(images: Floats, level: int) -> Floats:
     return images.reshape(*first, n_v // level, level, n_u // level, level).mean(axis=(-3, -1))
 
 
-def _halve_voxels(volume: Volume) -> Volume:
-    """Return a volume with voxels half as large, whose values vary linearly in a voxel and have its mean.
+def _scatter(scores: Floats) -> Floats:
+    """Return the covariance (k, k) of the sum of scores (k, M, n_v, n_u) that are correlated within regions of an image.
 
-    Its images change less abruptly with motion than those of uniform voxels.
+    It is the sum of the products of the regions' sums, see Liang and Zeger, Biometrika 73 (1986) 13.
     """
-    array = np.asarray(volume.array, np.float32)
-    for axis in range(3):
-        change = np.gradient(array, axis=axis) / 4 if array.shape[axis] > 1 else 0 * array
-        array = np.stack([array - change, array + change], axis + 1).reshape(
-            *np.multiply(array.shape, 1 + (np.arange(3) == axis))
-        )
-    n_x, n_y, n_z = volume.grid.shape
-    affine = volume.grid.affine @ affine_matrix(np.eye(3) / 2, np.full(3, -0.25))
-    return Volume(array, Grid((2 * n_x, 2 * n_y, 2 * n_z), affine), volume.quantity)
+    for axis in (2, 3):
+        n = scores.shape[axis]
+        scores = np.add.reduceat(scores, np.unique(np.arange(_REGIONS) * n // _REGIONS), axis)
+    sums = scores.reshape(len(scores), -1)
+    n = sums.shape[1]
+    return sums @ sums.T * n / max(1, n - len(sums))
 
 
-def _laplacian(array: Floats32) -> Floats32:
+def _second_differences(array: Floats32) -> Floats32:
     """Return the sum of the second differences along the axes."""
-    return np.asarray(sum(np.gradient(np.gradient(array, axis=axis), axis=axis) for axis in range(3)), np.float32)
+    total = np.zeros_like(array)
+    for axis in range(3):
+        steps = np.diff(np.moveaxis(array, axis, 0), axis=0)
+        along = np.moveaxis(total, axis, 0)
+        along[:-1] += steps
+        along[1:] -= steps
+    return total

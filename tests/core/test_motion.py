@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from benchmarks.motion import MOTIONS, VIEWS, errors, reference
+import mphdrr.core as mph
+from benchmarks.motion import MOTIONS, VIEWS, errors, reference, transmissions
 
 
 def check(volume, photons, motion, n_draws, tolerance):
@@ -20,6 +21,21 @@ def check(volume, photons, motion, n_draws, tolerance):
 @pytest.mark.parametrize("motion", MOTIONS)
 def test_errors_are_those_that_are_stated(motion):
     check(reference(48, 3.0, 4), 100, motion, 25, 0.3)  # 25 draws know a scatter to 0.1 to 0.2
+
+
+@pytest.mark.parametrize(("n", "spacing", "n_poses"), [(48, 3.0, 3), pytest.param(72, 2.0, 8, marks=pytest.mark.long)])
+def test_errors_by_voxels_are_stated_when_noise_is_small(n, spacing, n_poses):
+    volume, rng = reference(n, spacing, 4), np.random.default_rng(5)
+    motions = rng.uniform(-1, 1, (n_poses, 6)) * np.repeat([4, 0.04], 3)  # mm, rad
+    images = [transmissions(VIEWS[::2], truth[:3], truth[3:]) for truth in motions]
+    for photons in (1e4, 1e6):
+        squares = np.zeros((n_poses, 6))
+        for i, truth in enumerate(motions):
+            counts = rng.poisson(photons * images[i])
+            motion = mph.find_motion(volume, np.log(photons / counts), VIEWS[::2], photons)
+            squares[i] = ([*motion.shift, *motion.rotation] - truth) ** 2 / np.diag(motion.covariance)
+        for part in (slice(3), slice(3, 6)):  # shift, turn
+            assert 0.4 < np.sqrt(squares[:, part].mean()) < 1.3
 
 
 @pytest.mark.long

@@ -7,12 +7,12 @@ import gpu
 import numpy as np
 from gpu_extras.batch import batch_for_shader
 
+from ...core.runs.display import Display
 from ..blender import windows
 from ..volumes import slices, volume_materials, volumes
 from . import frustums
 
 _LEFT, _BOTTOM, _WIDTH, _HEIGHT, _LETTERS = 90, 60, 14, 180, 12  # pixels at a resolution scale of 1
-_MARKS = (0.0, 0.25, 0.5, 0.75, 1.0)
 
 
 def rectangle() -> tuple[float, float, float, float]:
@@ -21,12 +21,12 @@ def rectangle() -> tuple[float, float, float, float]:
     return scale * _LEFT, scale * _BOTTOM, scale * _WIDTH, scale * _HEIGHT
 
 
-def labels(item: bpy.types.Object) -> tuple[str, list[str]]:
-    """Return the title above a volume's bar, and the numbers beside it from its lower end to the upper."""
+def labels(item: bpy.types.Object) -> tuple[str, dict[str, float]]:
+    """Return the title above a volume's bar, and the round numbers beside it with their places, from 0 to 1 upward."""
     settings = item.mphdrr_volume
     title = f"{settings.quantity}, {settings.unit}".removesuffix(", 1")
     low, high = settings.display_low, settings.display_high
-    return title, [f"{low + share * (high - low):.4g}" for share in _MARKS]
+    return title, {f"{value:.4g}": (value - low) / ((high - low) or 1.0) for value in Display().marks((low, high))}
 
 
 def _bar_volume(context: bpy.types.Context) -> bpy.types.Object | None:
@@ -53,6 +53,6 @@ def draw() -> None:
     batch_for_shader(shader, "TRI_STRIP", shape).draw(shader)
     letters = height / _HEIGHT * _LETTERS
     title, texts = labels(item)
-    text_ys = [bottom + share * height - 0.35 * letters for share in (*_MARKS, 1.0 + 1.8 * letters / height)]
+    text_ys = [bottom + share * height - 0.35 * letters for share in (*texts.values(), 1.0 + 1.8 * letters / height)]
     text_xs = [*(bar_left + 1.5 * width for _ in texts), bar_left]
     windows.draw_texts(zip((*texts, title), text_xs, text_ys, itertools.repeat((1.0,) * 4)), letters)

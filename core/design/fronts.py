@@ -10,11 +10,12 @@ import numpy as np
 
 from ..errors import InputError
 from ..figures.page import SUFFIXES, Page
-from ..figures.parts import INK, Axes, heading, ticks
+from ..figures.parts import INK, Axes, heading
 from ..files import AnyPath, require_ending, write_bytes
 from ..geometry.system import PinholeSystem
 from ..physics.performance import resolution, sensitivity
 from ..progress import Progress, part_of
+from ..runs.display import ticks
 from ..validation import one_of
 from .objectives import ball_points
 from .optimising import Design, optimize

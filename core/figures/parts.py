@@ -14,7 +14,6 @@ INK, FAINT = "#20262d", "#6b7480"
 """Colours on white paper: of text and lines, and of notes."""
 PLANES = ((2, 0, 1), (1, 0, 2), (0, 1, 2))
 """Axes of three views of a volume: the one across the plane, to the right, upward; seen from head, front and left."""
-_STEPS = (1.0, 2.0, 2.5, 5.0, 10.0)
 
 
 def heading(page: Page, title: str, lines: Sequence[str] = (), ink: str = INK, faint: str = FAINT) -> int:
@@ -32,15 +31,6 @@ def heading(page: Page, title: str, lines: Sequence[str] = (), ink: str = INK, f
 def heading_height(page: Page, lines: int) -> int:
     """Return the number of rows of a heading with `lines` lines of text below its title."""
     return round((3.1 + 1.45 * lines) * page.em)
-
-
-def ticks(low: float, high: float, max_steps: int) -> list[float]:
-    """Return round numbers from `low` to `high`, in at most `max_steps` steps."""
-    smallest_step = (high - low) / max(1, max_steps)
-    power = 10.0 ** np.floor(np.log10(smallest_step))
-    step = power * next(s for s in _STEPS if s * power >= smallest_step * (1 - 1e-9))
-    first = np.ceil(low / step - 1e-9)
-    return [float(step * n) for n in np.arange(first, np.floor(high / step + 1e-9) + 1)]
 
 
 class Axes(NamedTuple):
@@ -126,14 +116,13 @@ def color_bar(
     values = [display.value_at(share, window) for share in np.linspace(1.0, 0.0, max(2, height))]
     page.image(display.colored(values, window)[:, None], left, top, width, height)
     page.text(unit_text(unit), left, top - 0.9 * em, 0.9 * em, page.ink)
-    for share in (0.0, 0.25, 0.5, 0.75, 1.0):
-        row = top + height * (1 - share)
+    for value in display.marks(window):
+        row = top + height * (1 - float(display.shares(value, window)))
         page.line([(left + width, row), (left + width + 0.3 * em, row)], page.ink, 0.06 * em)
-        page.text(number(display.value_at(share, window)), left + width + 0.5 * em, row + 0.33 * em, 0.9 * em, page.ink)
+        page.text(number(value), left + width + 0.5 * em, row + 0.33 * em, 0.9 * em, page.ink)
 
 
 def bar_width(page: Page, display: Display, window: tuple[float, float], unit: str) -> int:
     """Return the width, pixels, of a colour bar with its numbers."""
-    texts = [number(display.value_at(share, window)) for share in (0.0, 0.25, 0.5, 0.75, 1.0)]
-    numbers_width = 1.6 * page.em + max(letters.width(text, 0.9 * page.em) for text in texts)
+    numbers_width = 1.6 * page.em + max(letters.width(number(v), 0.9 * page.em) for v in display.marks(window))
     return round(max(numbers_width, letters.width(unit_text(unit), 0.9 * page.em)))

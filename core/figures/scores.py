@@ -10,12 +10,12 @@ from ..geometry.frames import moved
 from ..reconstruction.scores.derenzo import DerenzoSector
 from ..reconstruction.scores.summary import VolumeScore
 from ..runs import letters
-from ..runs.display import Display
+from ..runs.display import Display, ticks
 from ..volumes.resampling import values_at
 from ..volumes.sights import full_slices
 from ..volumes.volume import Volume
 from .page import Page
-from .parts import FAINT, INK, Axes, bar_width, color_bar, heading, number, ticks
+from .parts import FAINT, INK, Axes, bar_width, color_bar, heading, number
 
 SIZE = (1800, 950)
 """Default width and height, pixels, of the page."""

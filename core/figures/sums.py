@@ -3,10 +3,10 @@
 import numpy as np
 
 from ..arrays import Bytes, Floats, Floats32
-from ..runs.display import Display
+from ..runs.display import Display, ticks
 from ..volumes.volume import LINE_INTEGRALS, Volume, require_quantity
 from .page import Page
-from .parts import INK, PLANES, Axes, arrange, bar_width, color_bar, heading, number, ticks
+from .parts import INK, PLANES, Axes, arrange, bar_width, color_bar, heading, number
 from .subject import FigureSubject
 
 _ROWS_OF_PANELS = (((0, 1, 2),), ((0,), (1, 2)), ((0,), (1,), (2,)))  # possible arrangements

@@ -24,6 +24,8 @@ DIVERGING, DARK_DIVERGING = "diverging", "dark diverging"
 """Colour maps of differences: blue below the middle and red above it; the middle is white, or nearly black on dark pages."""
 COLORS = tuple(name for name in _COLORS if name not in (DIVERGING, DARK_DIVERGING))
 """Names of the colour maps; all but grey are perceptually uniform."""
+_STEPS = (1.0, 2.0, 2.5, 5.0, 10.0)
+"""Steps between round numbers."""
 SCALES = ("linear", "sqrt", "log")
 _DECADES = 3.0
 """Decades that an automatic logarithmic window spans."""
@@ -97,6 +99,17 @@ class Display:
             return float(low * (high / low) ** share) if 0 < low < high else high * share
         return low + (high - low) * (share**2 if self.scale == "sqrt" else share)
 
+    def marks(self, window: tuple[float, float], max_steps: int = 5) -> list[float]:
+        """Return round numbers in a window for its colour bar: powers of ten on a logarithmic scale that spans several."""
+        low, high = window
+        if not low < high:
+            return [high]
+        if self.scale == "log" and low > 0:
+            powers = np.arange(np.ceil(np.log10(low) - 1e-9), np.floor(np.log10(high) + 1e-9) + 1)
+            if len(powers) > 1:
+                return [float(10.0**power) for power in powers[:: -(-(len(powers) - 1) // max_steps)]]
+        return ticks(low, high, max_steps)
+
     def colored(self, values: ArrayLike, window: tuple[float, float] | None = None) -> Bytes:
         """Return colours (..., 3), 8-bit sRGB, of `values` (...), in the given window or in their automatic one."""
         shares = self.shares(values, self.window(values) if window is None else window)
@@ -109,6 +122,15 @@ def _table(colors: str) -> Bytes:
     places = np.linspace(0, len(anchors) - 1, 256)
     channels = [np.interp(places, np.arange(len(anchors)), channel) for channel in anchors.T]
     return np.rint(np.stack(channels, axis=1)).astype(np.uint8)
+
+
+def ticks(low: float, high: float, max_steps: int) -> list[float]:
+    """Return round numbers from `low` to `high`, in at most `max_steps` steps."""
+    smallest_step = (high - low) / max(1, max_steps)
+    power = 10.0 ** np.floor(np.log10(smallest_step))
+    step = power * next(s for s in _STEPS if s * power >= smallest_step * (1 - 1e-9))
+    first = np.ceil(low / step - 1e-9)
+    return [float(step * n) for n in np.arange(first, np.floor(high / step + 1e-9) + 1)]
 
 
 def unit_text(unit: str) -> str:

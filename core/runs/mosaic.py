@@ -219,8 +219,8 @@ def _color_bar(display: Display, window: tuple[float, float], unit: str, height:
     unit = unit_text(unit)
     line, em = math.ceil(1.1 * size), round(size)
     top, bottom = 2 * line, height - line
-    steps = next((n for n in (4, 2) if bottom - top >= n * line), 1)  # as many steps as there is room for
-    marks = [(share, f"{display.value_at(share, window):.4g}") for share in np.linspace(1.0, 0.0, steps + 1).tolist()]
+    values = display.marks(window, min(5, max(1, (bottom - top) // line)))  # as many steps as there is room for
+    marks = [(float(display.shares(value, window)), f"{value:.4g}") for value in values]
     columns = max(letters.width(unit, size), 1.5 * em + max(letters.width(text, size) for _, text in marks))
     bar = np.full((height, math.ceil(columns) + em, 3), _BORDER, np.uint8)
     _write(bar, unit, line // 3, em // 2, size, shade=1.0)

@@ -180,8 +180,10 @@ def test_a_map_has_a_bar_in_the_unit_of_the_panels(scene, imported):
     assert middle == pytest.approx(scene.mphdrr_geometry.scanner.mphdrr_scanner.sensitivity, rel=1e-5)
     title, texts = color_bar.labels(item)
     settings = item.mphdrr_volume
-    assert title == "sensitivity, cps/MBq" and float(texts[0]) <= middle <= float(texts[-1])
-    assert float(texts[-1]) == pytest.approx(settings.maximum, rel=1e-3)
+    assert title == "sensitivity, cps/MBq" and settings.minimum <= middle <= settings.maximum
+    low, high = settings.display_low, settings.display_high
+    for text, place in texts.items():
+        assert float(text) == pytest.approx(low + place * (high - low), rel=1e-3, abs=1e-6)
     assert settings.maximum == pytest.approx(settings.display_high, rel=1e-3)
     assert len(slices.planes_of(item)) == 3
 

@@ -203,7 +203,7 @@ def test_an_event_is_opened_with_truth_phantom_and_projections(recipe, scene, tm
     assert phantoms.settings_of(phantom).radius == pytest.approx(event.settings["radius"], rel=1e-6)
     item = runs.shown_run(scene)
     np.testing.assert_array_equal(read_run(storage.absolute(item.file)).projections, event.images("lines"))
-    assert item.name == f"Event {number} derenzo, lines" and runs.changes(scene) == []
+    assert item.name == f"lines, 8 × 8, Event {number} derenzo" and runs.changes(scene) == []
     assert len(scanner.modules(scanner.active_scanner(scene))) == 4, "the set's, since the scene had none"
 
 
@@ -269,7 +269,7 @@ def test_the_next_event_takes_the_place_of_the_one_before(recipe, scene, tmp_pat
     first, objects = scene.mphdrr_events.truth, set(bpy.data.objects)
     bpy.ops.mphdrr.open_event(opened=2, model="counts")
     assert set(bpy.data.objects) == objects and scene.mphdrr_events.truth == first
-    assert first.name.startswith("Event 2 ") and runs.shown_run(scene).name.endswith(", counts")
+    assert first.name.startswith("Event 2 ") and runs.shown_run(scene).name.startswith("counts, ")
     bpy.ops.mphdrr.try_event(number=1)
     assert only_phantom().visible_get() and not first.visible_get()
     bpy.data.objects.remove(first)

@@ -149,7 +149,10 @@ def stop_training(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(
         training,
         "prepare_samples",
-        lambda source, folder, splits, *_: (source.kind, [Samples(folder, source.draws(split)) for split in splits])[1],
+        lambda source, folder, splits, *_: (
+            source.size,
+            [Samples(source, folder, source.draws(split)) for split in splits],
+        )[1],
     )
     patch.setattr(training, "_fit", cancelled)
 

@@ -289,11 +289,8 @@ def test_events_are_tried_made_and_opened(window, work_folder):
     assert 0 < seen["after_cancel"] < 12 and seen["made"] == 12 and seen["kept"]
     assert any(text.startswith("Making events") and text.endswith(" left") for text in seen["words"]), seen["words"]
     assert min(seen["pauses"]) < 0.1, "the window stands still"
-    assert (
-        seen["opened"].startswith("Event 3 ")
-        and seen["run"].startswith("lines, ")
-        and seen["run"].endswith(seen["opened"])
-    )
+    opened, run = seen["opened"], seen["run"]
+    assert opened.startswith("Event 3 ") and run.startswith("lines, ") and run.endswith(opened)
     assert seen["image"] == "mphDRR mosaic" and seen["changes"] == []
 
 

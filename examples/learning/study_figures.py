@@ -11,10 +11,10 @@ import numpy as np
 import mphdrr.core as mph
 from mphdrr.core.events import EventSet
 from mphdrr.core.figures.page import Page
-from mphdrr.core.figures.parts import FAINT, INK, Axes, heading, ticks
+from mphdrr.core.figures.parts import FAINT, INK, Axes, heading
 from mphdrr.core.learning.judging.records import Records
 from mphdrr.core.learning.judging.statistics import ratio_of_means
-from mphdrr.core.runs.display import Display
+from mphdrr.core.runs.display import Display, ticks
 
 NAMES = {
     "after-osem": "1 U-Net after OSEM",

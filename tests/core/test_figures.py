@@ -71,7 +71,8 @@ def test_sums_print_translation_and_rotation(subject, tmp_path):
     largest = max(float(orthogonal_sum(subject.volume, axis)[0].max()) for axis in range(3))
     assert {
         "Orthogonal sums: Derenzo &lt;&amp;&gt;", "T = (10, 0, −5.5) mm    R = (φ, θ, ψ) = (30, 55, −10)°",
-        "40 × 40 × 40 voxels of 2.6 × 2.6 × 2.6 mm", f"{largest // 1000 * 1000:g}", "kBq/mL · mm", *(f"Sum along {x}" for x in "xyz"),
+        "40 × 40 × 40 voxels of 2.6 × 2.6 × 2.6 mm", f"{largest // 1000 * 1000:g}", "kBq/mL · mm",
+        *(f"Sum along {x}" for x in "xyz"),
     } <= set(texts(draw("sums", subject), tmp_path))  # fmt: skip
     ct = FigureSubject(volume=mph.Volume(np.zeros((4, 4, 4)), mph.Grid.centered(4, 1.0), "hu"))
     refused(lambda: draw("sums", ct), "orthogonal sums: expected a volume of activity or mu, got hu")

@@ -130,7 +130,7 @@ def ticks(low: float, high: float, max_steps: int) -> list[float]:
     power = 10.0 ** np.floor(np.log10(smallest_step))
     step = power * next(s for s in _STEPS if s * power >= smallest_step * (1 - 1e-9))
     first = np.ceil(low / step - 1e-9)
-    return [float(step * n) for n in np.arange(first, np.floor(high / step + 1e-9) + 1)]
+    return [float(step * n) + 0.0 for n in np.arange(first, np.floor(high / step + 1e-9) + 1)]  # -0 is 0
 
 
 def unit_text(unit: str) -> str:

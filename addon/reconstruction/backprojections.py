@@ -20,7 +20,8 @@ def backproject_job(context: bpy.types.Context, recipe: Recipe, how: str) -> job
     `how` is one of the combinations in `core.perspective.backprojection`. Raises InputError where no run is shown.
     """
     scene, run_item = context.scene, runs.required_run(context.scene, "back-project")
-    path, name, folder, uid = rendering.run_file_path(run_item.file), run_item.name, storage.folder(), scene.session_uid
+    path, name = rendering.run_file_path(run_item.file), runs.subject_of(run_item)
+    folder, uid = storage.folder(), scene.session_uid
     label, start = HOW_LABELS[how], time.perf_counter()
 
     def work(progress: Progress) -> stored_volumes.StoredVolume:

@@ -77,7 +77,7 @@ def reconstruct_job(context: bpy.types.Context, recipe: Recipe) -> jobs.Job:
     The volume appears in the scene with the first iteration that is shown. The object of an earlier reconstruction stays.
     """
     run = runs.required_run(context.scene, "reconstruct")
-    return _make_job(context, recipe, rendering.run_file_path(run.file), run.name)
+    return _make_job(context, recipe, rendering.run_file_path(run.file), runs.subject_of(run))
 
 
 def continue_job(context: bpy.types.Context) -> jobs.Job:
@@ -96,7 +96,7 @@ def continue_job(context: bpy.types.Context) -> jobs.Job:
     recipe = recipe_from_tables(reconstruction.settings["recipe"])
     recipe = recipe.updated({"reconstruction.iterations": MORE_ITERATIONS})
     previous = _PreviousResult(item.session_uid, reconstruction, stored)
-    return _make_job(context, recipe, rendering.run_file_path(run.file), run.name, previous)
+    return _make_job(context, recipe, rendering.run_file_path(run.file), runs.subject_of(run), previous)
 
 
 def _make_job(

@@ -121,6 +121,12 @@ def shown_run(scene: bpy.types.Scene) -> bpy.types.PropertyGroup | None:
     return next((item for item in settings.runs if item.file == settings.run_file), None)
 
 
+def subject_of(item: bpy.types.PropertyGroup) -> str:
+    """Return the name of what a run is of, for results made from it: the user's, else its volume's, else the run's."""
+    volume = json.loads(item.state).get("volume") if item.state and item.name == item.usual_name else None
+    return str(volume["name"] if volume else item.name)
+
+
 def run_settings(scene: bpy.types.Scene) -> Mapping[str, Any]:
     """Return all settings on which the shown run's numbers depend; empty where they are not known."""
     item = shown_run(scene)

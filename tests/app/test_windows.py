@@ -297,7 +297,7 @@ def test_events_are_tried_made_and_opened(window, work_folder):
 def test_measured_counts_are_imported_in_the_window(window, work_folder):
     seen = window("counts")
     assert seen["browsers"] == 1
-    assert seen["runs"] == ["SPECT Counts, 600 s, 32 × 32, counts.npy"] and seen["image"] == ["mphDRR mosaic"]
+    assert seen["runs"] == ["SPECT Counts, 32 × 32, counts.npy"] and seen["image"] == ["mphDRR mosaic"]
     assert seen["said"].startswith("counts.npy, 600 s, frames front+v.") and seen["changes"] == []
 
 

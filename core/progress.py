@@ -22,10 +22,10 @@ class StagedProgress:
         self.stages = stages
         self._job = stages(label)
 
-    def __call__(self, done: int, total: int) -> None:
-        """Report that `done` of `total` steps of the whole job are done."""
+    def __call__(self, n_done: int, total: int) -> None:
+        """Report that `n_done` of `total` steps of the whole job are done."""
         if self._job is not None:
-            self._job(done, total)
+            self._job(n_done, total)
 
 
 def stages_of(progress: Progress | None) -> Stages:
@@ -33,15 +33,15 @@ def stages_of(progress: Progress | None) -> Stages:
     return progress.stages if isinstance(progress, StagedProgress) else lambda label: progress
 
 
-def tell(progress: Progress | None, done: int, total: int, remark: Callable[[], str] | None = None) -> None:
-    """Call ``progress(done, total)`` unless it is None, after its attribute `remark`, if it has one, was set.
+def tell(progress: Progress | None, n_done: int, total: int, remark: Callable[[], str] | None = None) -> None:
+    """Call ``progress(n_done, total)`` unless it is None, after its attribute `remark`, if it has one, was set.
 
     A `remark` returns a text on the last step, such as its loss.
     """
     if progress is not None:
         if remark is not None and hasattr(progress, "remark"):
             progress.remark = remark
-        progress(done, total)
+        progress(n_done, total)
 
 
 def part_of(progress: Progress | None, number: int, count: int) -> Progress | None:

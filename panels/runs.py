@@ -72,8 +72,8 @@ def draw_changes(layout: bpy.types.UILayout, scene: bpy.types.Scene) -> None:
         return
     box = layout.box()
     box.alert = runs.has_scene_changed(scene)
-    others = "Shown run:" if lines == [runs.UNKNOWN] else "Shown run, of other settings than the panel's:"
-    draw_text(box, "Not of the scene as it is now:" if box.alert else others, "ERROR" if box.alert else "INFO")
+    heading = "Shown run:" if lines == [runs.UNKNOWN] else "Shown run, of other settings than the panel's:"
+    draw_text(box, "Not of the scene as it is now:" if box.alert else heading, "ERROR" if box.alert else "INFO")
     column = box.column(align=True)
     for line in lines:
         draw_text(column, line, icon="DOT")

@@ -375,9 +375,8 @@ def _find_volume(scene: bpy.types.Scene, old: Mapping[str, Any] | None) -> bpy.t
         return None
     scene_volumes = volumes.volume_objects(scene)
     matches = [item for item in scene_volumes if item.name == old["name"]]
-    return next(
-        iter(matches or [item for item in scene_volumes if volumes.content_key(item) == old.get("content")]), None
-    )
+    matches = matches or [item for item in scene_volumes if volumes.content_key(item) == old.get("content")]
+    return next(iter(matches), None)
 
 
 def _volume_changes(

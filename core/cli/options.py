@@ -253,8 +253,8 @@ class ProgressBar:
         if n_done > n_first:
             seconds = (time_done - first_time) / (n_done - n_first)  # of a step
             texts.append(f"{1 / max(seconds, 1e-9):.1f} steps/s" if seconds < 1 else f"{seconds:.1f} s per step")
-            left = duration_text(max(0.0, seconds * (total - n_done) - idle))
-            texts.append(self._status_text() if self._status_text else f"{left} left")
+            time_left = duration_text(max(0.0, seconds * (total - n_done) - idle))
+            texts.append(self._status_text() if self._status_text else f"{time_left} left")
         return f"{self._label}: {', '.join(texts)}"
 
 

@@ -114,7 +114,7 @@ def check(folder: AnyPath, progress: Progress | None = None) -> list[Fault]:
         return fault
 
     none = {number: [FileLocation(str(target.store.event_path(number)))] for number in requested.difference(copies)}
-    files = [(number, location) for number, found in sorted((none | copies).items()) for location in found]
+    files = [(number, location) for number, places in sorted((none | copies).items()) for location in places]
     with ThreadPoolExecutor(cores()) as pool:
         for n_checked, fault in enumerate(pool.map(find_fault, *zip(*files, strict=True)), 1):
             if fault is not None:

@@ -242,8 +242,8 @@ def reconstruction_grid(run: ProjectionRun, recipe: Recipe, method: Method | Non
     side, spacing = 2 * run.system.region_radius(), recipe["reconstruction.spacing"]
     voxels = recipe["reconstruction.voxels"] or _FEWEST
     if "reconstruction.voxels" not in recipe.given and spacing is None:
-        wanted = np.clip(np.ceil(2 * side / _smallest_detail(run)), _FEWEST, _MOST)
-        voxels = max(1, int(min(wanted, 2 * side // _pixel_at_isocentre(run.views))))
+        for_detail = np.clip(np.ceil(2 * side / _smallest_detail(run)), _FEWEST, _MOST)
+        voxels = max(1, int(min(for_detail, 2 * side // _pixel_at_isocentre(run.views))))
     n_x, n_y, n_z = np.broadcast_to(voxels, 3).tolist()
     spacing = spacing or side / np.array([n_x, n_y, n_z])
     return Grid.centered((n_x, n_y, n_z), np.broadcast_to(spacing, 3), recipe["reconstruction.center"])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import html
 import json
 import re
 
@@ -168,7 +169,8 @@ def test_that_a_score_flatters_stays_with_it(system, tmp_path, command):
     arguments = ["score", tmp_path / "v.npz", "--truth", tmp_path / "run.npz"]
     assert json.loads(command(*arguments, "--json").out)["notes"] == flatters
     said = command(*arguments, "--picture", tmp_path / "p.svg").err
-    assert all(f"mphdrr: {text}" in said and text in (tmp_path / "p.svg").read_text("utf-8") for text in flatters)
+    drawn = html.unescape((tmp_path / "p.svg").read_text("utf-8"))
+    assert all(f"mphdrr: {text}" in said and text in drawn for text in flatters)
     coarse = mph.Volume(np.ones((12, 12, 12)), mph.Grid.centered(12, 8.0))
     mph.write_volume(coarse, tmp_path / "v.npz")
     assert json.loads(command(*arguments, "--json").out)["notes"] == flatters[1:]

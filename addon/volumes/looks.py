@@ -122,9 +122,9 @@ def _cut_node_tree(name: str) -> bpy.types.NodeTree:
 def new_material(
     name: str, colors: volume_materials.Ramp, rgb: tuple[float, float, float] | None = None
 ) -> bpy.types.Material:
-    """Return a dull material in the linear colour `rgb`, by default the second brightest of a ramp's colours."""
+    """Return a dull material in the linear colour `rgb`, by default that of a ramp at three quarters of its range."""
     material, shader = compat.surface_material(name, "ShaderNodeBsdfPrincipled")
-    color = (*(rgb or colors[-2][1]), 1.0)
+    color = (*(rgb or volume_materials.color_at(colors, 0.75)), 1.0)
     material.diffuse_color = color
     shader.inputs["Base Color"].default_value, shader.inputs["Roughness"].default_value = color, 0.6
     return material

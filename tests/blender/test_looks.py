@@ -20,6 +20,7 @@ from mphdrr.core.physics.ct_numbers import hu_to_mu
 from mphdrr.core.physics.maps import sensitivity_map
 from mphdrr.core.physics.materials import attenuation
 from mphdrr.core.physics.performance import sensitivity
+from mphdrr.core.runs.display import Display
 from mphdrr.core.volumes.volume import Volume
 
 from .conftest import datablocks, refused, reopened, slice_pixels, update
@@ -200,7 +201,17 @@ def test_a_map_of_an_older_file_is_shown_in_the_same_unit(scene, tmp_path):
     assert settings.unit == "cps/MBq" and settings.display_high == pytest.approx(shown) == pytest.approx(200.0)
 
 
-def test_crystals_phantoms_maps_and_the_selection_share_no_hue(scene):
+def test_activity_has_the_colours_of_the_mosaic_on_slices_and_as_smoke(nema):
+    values = np.linspace(0.0, 1.0, 256)
+    expected = Display().colored(values, (0.0, 1.0)) / 255
+    assert np.abs(slices.color_table("activity")[:, :3] - expected).max() < 0.025
+    for smoke in (False, True):
+        shown = slices.color_table("", volume_materials.item_ramp(nema, smoke))[:, :3]
+        assert np.abs(shown - expected).max() < 0.025
+    assert Display().colors == "inferno" == bpy.context.scene.mphdrr_display.colors.lower()
+
+
+def test_crystals_maps_and_the_selection_share_no_hue(scene):
     theme = bpy.context.preferences.themes[0].view_3d
     assert volume_materials.ramp("hu") == volume_materials.ramp("mu") != volume_materials.ramp("activity")
 
@@ -213,7 +224,7 @@ def test_crystals_phantoms_maps_and_the_selection_share_no_hue(scene):
         return hues(*np.column_stack([np.interp(shares, positions, channel) for channel in np.transpose(colors)]))
 
     found = {
-        "crystal": hues(LOOKS["crystal"].color), "phantom": ramp("activity"), "map": ramp("resolution"),
+        "crystal": hues(LOOKS["crystal"].color), "map": ramp("resolution"),
         "selection": hues(theme.object_selected, theme.object_active),
     }  # fmt: skip
     for name, one in found.items():

@@ -25,7 +25,7 @@ _LATTICE = "mphdrr_slice_of"  # custom property: shape and affine of the grid th
 _MATERIAL = "mphdrr_material"  # custom property: a plane's own material, with its picture
 _GROUP = "mphDRR Slice"  # the node group that draws all slices
 _SHADES = 256
-_FRONT = (0.7, -0.5, 0.5)  # direction towards the viewer of a new scene: the volume is cut open on that side
+FRONT = (0.7, -0.5, 0.5)  # direction towards the viewer of a new scene: the volume is cut open on that side
 
 # The volume of which slices were drawn last, with its file: reading it takes longer than everything else.
 _last_volume: tuple[Path, Volume] | None = None
@@ -83,7 +83,7 @@ def slice_track(item: bpy.types.Object, axis: int) -> tuple[Vector, Vector]:
     """Return a front corner of the first plane across a grid axis, and the step to the next plane; in world mm."""
     shape, affine = json.loads(planes_of(item)[0][_LATTICE])  # of any plane: the user may have deleted others
     world = np.array(item.matrix_world) @ affine
-    corner = np.where(np.linalg.inv(world)[:3, :3] @ _FRONT >= 0, np.array(shape) - 0.5, -0.5)
+    corner = np.where(np.linalg.inv(world)[:3, :3] @ FRONT >= 0, np.array(shape) - 0.5, -0.5)
     corner[axis] = 0.0
     return Vector((world @ [*corner, 1.0])[:3]), Vector(world[:3, axis])
 
@@ -127,7 +127,7 @@ def update(item: bpy.types.Object) -> None:
         add_slices(item)
         return
     normals = np.linalg.inv(volume.grid.affine)  # grid indices from the object's space, mm
-    front = np.array(_FRONT) @ volumes.pose_of_object(item)[:3, :3]
+    front = np.array(FRONT) @ volumes.pose_of_object(item)[:3, :3]
     cut = []
     for plane in planes:
         axis = plane[_KEY]

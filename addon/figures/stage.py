@@ -4,13 +4,13 @@ The camera sees the figure's paper behind the scene. Each module can be lit, and
 viewer and the isocentre.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 from functools import partial
 
 import bpy
 import numpy as np
 from mathutils import Color, Vector
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from ...core.figures.kinds import FigureKind
 from ...core.figures.subject import FigureSubject
@@ -42,6 +42,7 @@ _METALLIC_FACTOR = 0.3  # factor on the metallic look of materials, which would 
 _GLOW, _TINT = 0.12, 0.55  # emission strength of lit modules, and share of the accent in their colour
 _WORLD = 0.5  # brightness of the surroundings, which metal reflects
 
+_SEGMENTS = 16  # of a ray: the boxes around short ones, by which Cycles finds what it hits, are small
 _ANGLES = np.linspace(0.0, 2 * np.pi, 64, endpoint=False)
 _SPHERE = np.stack(  # points (N, 3) of a sphere of radius 1
     [
@@ -71,7 +72,8 @@ class FigureScene:
         self.system = self.full_system if view.lit else chosen_system
         self.scene = scene = bpy.data.scenes.new(ids.STUDIO)
         self.radius = self.full_system.region_radius()
-        self._meshes = list[tuple[bpy.types.Mesh, NDArray[np.intp]]]()  # each with the index of every face's module
+        self._materials = dict[tuple[str, bool], bpy.types.Material]()  # by the part's kind, and whether it fades
+        self._parts = list[tuple[bpy.types.Object, int]]()  # each with the index of its module
         try:
             studio.furnish(scene)
             scene.frame_set(bpy.context.scene.frame_current)
@@ -117,11 +119,11 @@ class FigureScene:
         fades = np.clip((_GONE - facing) / (_GONE - _SOLID), 0.0, 1.0)
         opacities = fades if self.studio.cut else np.ones(len(numbers))
         opacities = np.maximum(opacities, _MIN_OPACITY * np.isin(numbers, rays) * (len(rays) == 1))
-        attribute_values = {"lit": _TINT * np.isin(numbers, lit) * self.studio.lit, "opacity": opacities}
-        for mesh, face_modules in self._meshes:
-            for name, module_values in attribute_values.items():
-                mesh.attributes[name].data.foreach_set("value", module_values[face_modules].astype(np.float32))
-            mesh.update()
+        tints = _TINT * np.isin(numbers, lit) * self.studio.lit
+        for part, index in self._parts:
+            part.color = (tints[index], 0.0, 0.0, opacities[index])
+            part.hide_render = not opacities[index]
+            part.data.materials[0] = self._materials[part["kind"], bool(opacities[index] < 1)]
         for number, opacity in zip(numbers.tolist(), opacities, strict=True):
             if number in self.rays:
                 self.rays[number].hide_render = number not in rays or not opacity
@@ -138,28 +140,28 @@ class FigureScene:
         scene = self.scene
         items = list(scene.collection.all_objects)
         datablocks = {item.data for item in items if item.type != "VOLUME"}
-        materials = {m for data in datablocks for m in getattr(data, "materials", ()) if m.name.startswith(ids.STUDIO)}
+        materials = {
+            m for data in datablocks for m in getattr(data, "materials", ()) if m and m.name.startswith(ids.STUDIO)
+        }
+        materials.update(self._materials.values())
         collections, world = list(scene.collection.children), scene.world
         bpy.data.scenes.remove(scene)
         bpy.data.batch_remove([*items, *datablocks, *materials, *collections, *filter(None, [world])])
 
     def _add_modules(self) -> None:
-        """Add all collimators as one object, and all crystals as another."""
-        module_index = dict(zip(self.system.numbers.tolist(), range(len(self.system)), strict=True))
-        parts = self.system.parts(self.subject.construction)
-        for kind in dict.fromkeys(part.kind for part in parts):
-            kind_parts = [part for part in parts if part.kind == kind]
-            first_vertices = np.cumsum([0, *(len(part.vertices) for part in kind_parts)])
-            faces = [part.solid[1] + first for part, first in zip(kind_parts, first_vertices[:-1], strict=True)]
+        """Add the parts of all modules, and the materials of whole and of fading parts."""
+        index = {number: i for i, number in enumerate(self.system.numbers.tolist())}
+        for part in self.system.parts(self.subject.construction):
+            if (part.kind, True) not in self._materials:
+                self._materials |= {
+                    (part.kind, fades): _figure_material(part.kind.upper(), fades) for fades in (False, True)
+                }
             mesh = bpy.data.meshes.new(ids.STUDIO)
-            vertices = np.concatenate([part.vertices for part in kind_parts])
-            collimators.reshape_mesh(mesh, (vertices, np.concatenate(faces)))
-            mesh.materials.append(_figure_material(kind.upper()))
-            for name in ("lit", "opacity"):
-                mesh.attributes.new(name, "FLOAT", "FACE")
-            face_modules = np.repeat([module_index[part.number] for part in kind_parts], [len(f) for f in faces])
-            self._meshes.append((mesh, face_modules))
-            self.add_object(mesh)
+            collimators.reshape_mesh(mesh, (part.vertices, part.solid[1]))
+            mesh.materials.append(None)
+            item = self.add_object(mesh)
+            item["kind"] = part.kind
+            self._parts.append((item, index[part.number]))
 
     def _add_surface(self, surface: Surface) -> tuple[Points, float]:
         """Add the volume's surface, and return its centre and the radius, mm, within which nearly all of it lies."""
@@ -183,18 +185,22 @@ class FigureScene:
         """Return the principal rays by module number: thin shining tubes from each pinhole to the isocentre."""
         centers = self.system.poses()[:, :3, 3]
         return dict(
-            zip(self.system.numbers.tolist(), self._add_tubes([[c, 0 * c] for c in centers], _ACCENT), strict=True)
+            zip(
+                self.system.numbers.tolist(),
+                self._add_tubes(np.linspace(centers, 0 * centers, _SEGMENTS, axis=1), _ACCENT),
+                strict=True,
+            )
         )
 
     def _add_tubes(
-        self, lines: Sequence[ArrayLike], color: tuple[float, ...], is_closed: bool = False
+        self, lines: Iterable[Points], color: tuple[float, ...], is_closed: bool = False
     ) -> list[bpy.types.Object]:
         """Return thin shining tubes along lines of points (N, 3), mm, which cast no shadows."""
         material, emission = compat.surface_material(ids.STUDIO, "ShaderNodeEmission")
         emission.inputs["Color"].default_value, tubes = color, []
         for line in lines:
             curve = bpy.data.curves.new(ids.STUDIO, "CURVE")
-            curve.dimensions, curve.bevel_depth = "3D", _TUBE_RADIUS * self.radius
+            curve.dimensions, curve.bevel_depth, curve.bevel_resolution = "3D", _TUBE_RADIUS * self.radius, 1
             spline = curve.splines.new("POLY")
             spline.points.add(len(line) - 1)
             spline.points.foreach_set("co", np.column_stack([line, np.ones(len(line))]).ravel())
@@ -241,10 +247,10 @@ def _set_backdrop(world: bpy.types.World, paper: str) -> None:
     add_node("ShaderNodeOutputWorld", (450, 0), {"Surface": mix.outputs[0]})
 
 
-def _figure_material(part: str) -> bpy.types.Material:
-    """Return a copy of a part's material that follows two attributes of faces.
+def _figure_material(part: str, fades: bool) -> bpy.types.Material:
+    """Return a copy of a part's material that follows its object's colour: red is the tint by the accent, alpha the opacity.
 
-    Attribute "lit" mixes in the accent's colour; attribute "opacity" is the opacity, 0 to 1.
+    Only that of parts that `fades` is transparent, since light takes long through what may be.
     """
     material = collimators.part_material(part).copy()
     material.name, tree = ids.STUDIO, material.node_tree
@@ -252,15 +258,15 @@ def _figure_material(part: str) -> bpy.types.Material:
     if output is None or not output.inputs["Surface"].links:  # a material of the user's own
         return material
     add_node, surface = partial(compat.add_node, tree), output.inputs["Surface"]
-    lit, opacity = (
-        add_node("ShaderNodeAttribute", (600, y), attribute_name=name).outputs["Fac"]
-        for name, y in (("lit", 300), ("opacity", 500))
-    )
-    lit_inputs = {"Base Color": _ACCENT, "Roughness": 0.5, "Emission Color": _ACCENT, "Emission Strength": _GLOW}
-    accent = add_node("ShaderNodeBsdfPrincipled", (600, -200), lit_inputs).outputs[0]
+    info = add_node("ShaderNodeObjectInfo", (400, 300)).outputs
+    tint = add_node("ShaderNodeSeparateColor", (600, 300), {0: info["Color"]}).outputs[0]
+    tint_inputs = {"Base Color": _ACCENT, "Roughness": 0.5, "Emission Color": _ACCENT, "Emission Strength": _GLOW}
+    accent = add_node("ShaderNodeBsdfPrincipled", (600, -200), tint_inputs).outputs[0]
     if principled := next((node for node in tree.nodes if node.type == "BSDF_PRINCIPLED"), None):
         principled.inputs["Metallic"].default_value *= _METALLIC_FACTOR  # metal would mirror the surroundings
-    tinted = add_node("ShaderNodeMixShader", (800, 0), {0: lit, 1: surface.links[0].from_socket, 2: accent}).outputs[0]
-    clear = add_node("ShaderNodeBsdfTransparent", (800, 200)).outputs[0]
-    tree.links.new(add_node("ShaderNodeMixShader", (1000, 0), {0: opacity, 1: clear, 2: tinted}).outputs[0], surface)
+    shader = add_node("ShaderNodeMixShader", (800, 0), {0: tint, 1: surface.links[0].from_socket, 2: accent}).outputs[0]
+    if fades:
+        clear = add_node("ShaderNodeBsdfTransparent", (800, 200)).outputs[0]
+        shader = add_node("ShaderNodeMixShader", (1000, 0), {0: info["Alpha"], 1: clear, 2: shader}).outputs[0]
+    tree.links.new(shader, surface)
     return material

@@ -30,7 +30,7 @@ def set_up(scene: bpy.types.Scene, size: tuple[int, int], samples: int) -> None:
     cycles = scene.cycles
     cycles.device, cycles.samples, cycles.max_bounces, cycles.seed = "CPU", samples, 4, 0
     cycles.use_adaptive_sampling, cycles.adaptive_threshold, cycles.adaptive_min_samples = True, 0.05, 4
-    cycles.use_denoising, cycles.denoising_prefilter = True, "FAST"
+    cycles.use_denoising, cycles.denoising_prefilter = True, "ACCURATE"
     (render.resolution_x, render.resolution_y), render.resolution_percentage = size, 100
     cycles.transparent_max_bounces = _MAX_TRANSPARENT
     render.image_settings.file_format, render.image_settings.color_mode = "PNG", "RGB"

@@ -30,16 +30,16 @@ _MARGIN = 0.04  # free margin around the scene, relative to the picture's shorte
 # Cosine between the directions to a module and to the camera at which the module begins to fade, and at which it is gone.
 _SOLID, _GONE = 0.1, 0.5
 _MIN_OPACITY = 0.3  # of a module that is lit alone
-_TUBE_RADIUS = 0.003  # of rays and the ROI's ring, relative to the ROI's radius
+_TUBE_RADIUS = 0.0025  # of rays and the ROI's ring, relative to the radius of what is framed
 _ACCENT = (0.09, 0.46, 0.62, 1.0)  # linear RGBA of rays and lit modules: a hue that no volume has
 _RING = (0.55, 0.60, 0.66, 1.0)  # of the ROI's ring
-_COLOR, _SHINE = "Color", 0.2  # attribute of the surface's colours, and the strength with which it shines by itself
-_BULK, _LEAST = (
-    (5.0, 95.0),
-    0.2,
-)  # percentiles of the surface that is framed, and its least radius relative to the ROI's
+# Attribute of the surface's colours; its own light, and the share of others' that it sends back.
+_COLOR, _SHINE, _DULL = "Color", 0.3, 0.6
+# Percentiles of the surface that is framed, and its least radius relative to the ROI's.
+_BULK, _LEAST = (5.0, 95.0), 0.2
+_ORIGINS = ("collimator", "source")  # parts from which rays begin
 _METALLIC_FACTOR = 0.3  # factor on the metallic look of materials, which would mirror the surroundings
-_GLOW, _TINT = 0.12, 0.55  # emission strength of lit modules, and share of the accent in their colour
+_GLOW, _TINT = 0.06, 0.45  # emission strength of lit modules, and share of the accent in their colour
 _WORLD = 0.5  # brightness of the surroundings, which metal reflects
 
 _SEGMENTS = 16  # of a ray: the boxes around short ones, by which Cycles finds what it hits, are small
@@ -73,18 +73,20 @@ class FigureScene:
         self.scene = scene = bpy.data.scenes.new(ids.STUDIO)
         self.radius = self.full_system.region_radius()
         self._materials = dict[tuple[str, bool], bpy.types.Material]()  # by the part's kind, and whether it fades
-        self._parts = list[tuple[bpy.types.Object, int]]()  # each with the index of its module
+        self._parts = list[tuple[bpy.types.Object, int, Points]]()  # each with its module's number, and its direction
         try:
             studio.furnish(scene)
             scene.frame_set(bpy.context.scene.frame_current)
             _set_backdrop(scene.world, paper)
             self._add_modules()
-            ring = self.radius * np.stack([np.cos(_ANGLES), np.sin(_ANGLES), 0 * _ANGLES], axis=1)
-            self._add_tubes([ring], _RING, is_closed=True)
             center, extent = np.zeros(3), self.radius
             if surface is not None:
                 center, extent = self._add_surface(surface)
-            self._near_points = center + (view.near or 1.0) * extent * _SPHERE
+            reach = (view.near or 4.0) * extent
+            self._near_points, self._tube_radius = center + reach * _SPHERE, _TUBE_RADIUS * reach
+            angles = np.linspace(0.0, 2 * np.pi, 240, endpoint=False)
+            ring = self.radius * np.stack([np.cos(angles), np.sin(angles), 0 * angles], axis=1)
+            self._add_tubes([ring], _RING, is_closed=True)
             self.rays = self._add_rays() if view.rays else {}
             self.camera = scene.camera = self.add_object(bpy.data.cameras.new(ids.STUDIO))
             self.camera.data.lens, self.camera.data.sensor_width = view.lens, _SENSOR_WIDTH
@@ -109,23 +111,22 @@ class FigureScene:
         direction = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]]) @ DIRECTION
         points = self._near_points
         if not self.studio.near:
-            points = np.concatenate([points, *(part.vertices for part in self.full_system.parts())])
+            points = np.concatenate([self.radius * _SPHERE, *(part.vertices for part in self.full_system.parts())])
         aim_camera(self.camera, direction, self.size, points)
         longer_side = max(self.size)
         distance = float(np.array(self.camera.location) @ direction)
         self.pixels_per_mm = longer_side * self.studio.lens / _SENSOR_WIDTH / distance  # at the isocentre
-        numbers, self.ray_numbers = self.system.numbers, rays
-        facing = -self.system.frames()[:, 2] @ direction
-        fades = np.clip((_GONE - facing) / (_GONE - _SOLID), 0.0, 1.0)
-        opacities = fades if self.studio.cut else np.ones(len(numbers))
-        opacities = np.maximum(opacities, _MIN_OPACITY * np.isin(numbers, rays) * (len(rays) == 1))
-        tints = _TINT * np.isin(numbers, lit) * self.studio.lit
-        for part, index in self._parts:
-            part.color = (tints[index], 0.0, 0.0, opacities[index])
-            part.hide_render = not opacities[index]
-            part.data.materials[0] = self._materials[part["kind"], bool(opacities[index] < 1)]
-        for number, opacity in zip(numbers.tolist(), opacities, strict=True):
-            if number in self.rays:
+        self.ray_numbers = rays
+        for part, number, outward in self._parts:
+            opacity = (
+                float(np.clip((_GONE - outward @ direction) / (_GONE - _SOLID), 0.0, 1.0)) if self.studio.cut else 1.0
+            )
+            if rays == [number]:
+                opacity = max(opacity, _MIN_OPACITY)
+            part.color = (_TINT * (number in lit and self.studio.lit), 0.0, 0.0, opacity)
+            part.hide_render = not opacity
+            part.data.materials[0] = self._materials[part["kind"], opacity < 1]
+            if number in self.rays and part["kind"] in _ORIGINS:
                 self.rays[number].hide_render = number not in rays or not opacity
 
     def moment(self, fraction: float) -> Moment:
@@ -150,7 +151,6 @@ class FigureScene:
 
     def _add_modules(self) -> None:
         """Add the parts of all modules, and the materials of whole and of fading parts."""
-        index = {number: i for i, number in enumerate(self.system.numbers.tolist())}
         for part in self.system.parts(self.subject.construction):
             if (part.kind, True) not in self._materials:
                 self._materials |= {
@@ -161,7 +161,8 @@ class FigureScene:
             mesh.materials.append(None)
             item = self.add_object(mesh)
             item["kind"] = part.kind
-            self._parts.append((item, index[part.number]))
+            center = part.vertices.mean(axis=0)
+            self._parts.append((item, part.number, center / max(float(np.linalg.norm(center)), 1e-9)))
 
     def _add_surface(self, surface: Surface) -> tuple[Points, float]:
         """Add the volume's surface, and return its centre and the radius, mm, within which nearly all of it lies."""
@@ -172,8 +173,11 @@ class FigureScene:
         color = compat.add_node(material.node_tree, "ShaderNodeAttribute", (-300, 0), attribute_name=_COLOR).outputs[
             "Color"
         ]
-        for name in ("Base Color", "Emission Color"):
-            material.node_tree.links.new(color, shader.inputs[name])
+        dulled = compat.add_node(
+            material.node_tree, "ShaderNodeVectorMath", (-150, 0), {0: color, "Scale": _DULL}, operation="SCALE"
+        )
+        material.node_tree.links.new(dulled.outputs[0], shader.inputs["Base Color"])
+        material.node_tree.links.new(color, shader.inputs["Emission Color"])
         shader.inputs["Emission Strength"].default_value, shader.inputs["Roughness"].default_value = _SHINE, 0.45
         item.data.materials.append(material)
         low, high = np.percentile(surface.mesh.vertices, _BULK, axis=0)
@@ -200,7 +204,7 @@ class FigureScene:
         emission.inputs["Color"].default_value, tubes = color, []
         for line in lines:
             curve = bpy.data.curves.new(ids.STUDIO, "CURVE")
-            curve.dimensions, curve.bevel_depth, curve.bevel_resolution = "3D", _TUBE_RADIUS * self.radius, 1
+            curve.dimensions, curve.bevel_depth, curve.bevel_resolution = "3D", self._tube_radius, 1
             spline = curve.splines.new("POLY")
             spline.points.add(len(line) - 1)
             spline.points.foreach_set("co", np.column_stack([line, np.ones(len(line))]).ravel())

@@ -21,7 +21,7 @@ from ..volumes import looks, slices, stored_volumes, volume_materials
 
 _LEVEL = 0.25  # value of the surface of a volume that the window shows as smoke, as a fraction of its display range
 _MAX_VOXELS = 300  # along each side; a finer volume is coarsened
-_DEPTHS = np.arange(0.5, 6.0, 0.5)  # distances behind the surface, voxels, among which the highest value is found
+_DEPTHS = np.arange(0.5, 4.5, 0.5)  # distances behind the surface, voxels, among which the highest value is found
 
 
 @dataclass(frozen=True)
@@ -76,12 +76,9 @@ def surface_maker(item: bpy.types.Object) -> Callable[[Volume, Progress], Surfac
         while max(volume.grid.shape) > _MAX_VOXELS:
             volume = stored_volumes.coarsen(volume)
         mesh = volume_to_mesh(volume, level, lambda done, total: progress(done, 2 * total))
-        values, is_inside = np.full(len(mesh.vertices), level), True
-        inward = -_normals(mesh) * volume.grid.spacing.min()
+        values, inward = np.full(len(mesh.vertices), level, np.float32), -_normals(mesh) * volume.grid.spacing.min()
         for index, depth in enumerate(_DEPTHS):
-            values_behind = values_at(volume, mesh.vertices + depth * inward)
-            is_inside &= values_behind >= level
-            values = np.where(is_inside, np.maximum(values, values_behind), values)
+            np.maximum(values, values_at(volume, mesh.vertices + depth * inward), out=values)
             progress(len(_DEPTHS) + index, 2 * len(_DEPTHS))
         return Surface(mesh, display.colored(factor * values, window), display, window, level * factor, unit)
 

@@ -165,9 +165,9 @@ def derenzo_score(
     Hallen et al. propose for the pairs of hot-rod phantoms. The probability that noise makes so large a difference of both
     means is below 0.1 %, by Student's two-sample t test, which compares it with the scatter of the rods and of the valleys.
     And in three quarters of the pairs' slices along the rods that ratio is below 0.735, too: means over the rods' length
-    hide speckle that a reader of the slices sees. Single pairs prove nothing: in noise without any rods a third of the sectors
-    may fulfil the first condition, but less than 0.1 % fulfilled the first two. Contrast recovery is the mean peak minus the
-    mean valley, divided by the same difference of the phantom: it is 1 only if the volume's values are right, too.
+    hide speckle that a reader of the slices sees. Single pairs prove nothing: in noise without any rods a third of the
+    sectors may fulfil the first condition, but less than 0.1 % fulfilled the first two. Contrast recovery is the mean peak
+    minus the mean valley, divided by the same difference of the phantom: it is 1 only if the values are right, too.
 
     Parameters
     ----------

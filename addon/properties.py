@@ -19,6 +19,7 @@ from bpy.props import (
     StringProperty,
 )
 
+from ..core.errors import InputError
 from ..core.geometry.system import PinholeSystem
 from .blender import choices, ids
 from .blender.file_properties import path_property
@@ -29,7 +30,7 @@ from .phantoms import phantom_properties
 from .pictures import display_properties
 from .reconstruction import reconstruction_properties
 from .runs import projection_properties
-from .scanner import column_maps, columns
+from .scanner import column_maps, columns, scanner
 from .scanner.collimators import PARTS
 
 
@@ -154,6 +155,21 @@ class ScannerProperties(bpy.types.PropertyGroup):
     calibration: StringProperty(name="Calibration", description="Result of the last calibration, lines as JSON")
 
 
+def _visible_modules(self: GeometryProperties) -> str:
+    """Return the numbers of the visible modules as text."""
+    collection = scanner.active_scanner(self.id_data)
+    return scanner.visible_modules(collection) if collection else ""
+
+
+def _show_modules(self: GeometryProperties, text: str) -> None:
+    """Show only the modules that a text lists; keep the reason where it lists none."""
+    self.visible_problem = ""
+    try:
+        scanner.show_modules(scanner.required_scanner(self.id_data), text)
+    except InputError as error:
+        self.visible_problem = str(error)
+
+
 class GeometryProperties(bpy.types.PropertyGroup):
     """State of the Geometry panel; `Scene.mphdrr_geometry`."""
 
@@ -162,8 +178,11 @@ class GeometryProperties(bpy.types.PropertyGroup):
                              update=on_edit("scanner_chosen"))  # fmt: skip
     active_index: IntProperty(name="Active Module", description="Index in the list", update=on_edit("active_module"))
     all_at_once: BoolProperty(name="All Modules", description="Show and change all modules, not the active one alone")
-    first: IntProperty(name="First", description="First module number of the range", default=1)
-    last: IntProperty(name="Last", description="Last module number of the range", default=40)
+    visible: StringProperty(
+        name="Visible Modules", description="Numbers of the modules that are shown, such as 1-40, 45; empty: all",
+        get=_visible_modules, set=_show_modules, search=scanner.suggested_ranges, search_options={"SUGGESTION"},
+    )  # fmt: skip
+    visible_problem: StringProperty(name="Problem", description="Reason why modules stay hidden", options={"SKIP_SAVE"})
     # Lines that `sight_lines.py` draws in the 3D views.
     show_rays: BoolProperty(name="Ray",
                             description="Draw the principal ray, through the isocentre to the virtual detector",

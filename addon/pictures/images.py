@@ -144,9 +144,9 @@ def tiles(image: bpy.types.Image | None) -> dict[str, Any] | None:
     """Return the mosaic's tiles: `numbers` and `rings` of its modules, `unit`, tile size `tile` and `corners`; None without.
 
     Rows and columns count from the top left. `window` is that of the colours; `totals` are each image's "sum" or "mean", as
-    `summed` says, and `maxima` its largest number; `half` tells whether only the middle halves of the images are used and
-    shown. `display` is the display of all pictures, "None" while they are being made. Files of earlier versions lack these
-    six.
+    `summed` says, and `maxima` its largest number; `half` tells whether these are of the middle halves, which are shown;
+    `share` are the fractions of the images' width and height that the mosaic shows. `display` is the display of all
+    pictures, "None" while they are being made. Files of earlier versions lack these seven.
     """
     return None if image is None or _TILES not in image else image[_TILES].to_dict()
 
@@ -165,8 +165,9 @@ def mosaic_views(mosaic: bpy.types.Image) -> tuple[Views, NDArray[np.float64]] |
 
 
 def shown_fraction() -> tuple[float, float]:
-    """Return the fractions of the exact images' width and height that the pictures show."""
-    x, y = (tiles(bpy.data.images.get(ids.MOSAIC)) or {}).get("share", (1.0, 1.0))
+    """Return the fractions of the exact images' width and height that their pictures, but for the mosaic, show."""
+    shown = tiles(bpy.data.images.get(ids.MOSAIC)) or {}
+    x, y = shown["share"] if shown.get("half") else (1.0, 1.0)
     return x, y
 
 
@@ -198,7 +199,7 @@ def projection_name(number: int, numbers: list[int]) -> str:
 def _color(projections: NDArray[np.float32], display: Display, progress: Progress | None = None) -> list[bytes]:
     """Return the pictures of projections (M, n_v, n_u) in one window, as PNG files; `progress` counts them."""
     window = display.window(projections)
-    shown_pictures = block_means(as_seen(display.part(projections)), _MAX_PIXELS)
+    shown_pictures = block_means(as_seen(display.field(projections)), _MAX_PIXELS)
     return _make_all(lambda picture: png_bytes(display.colored(picture, window), _PNG_LEVEL), shown_pictures, progress)
 
 

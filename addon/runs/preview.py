@@ -124,9 +124,9 @@ def make_preview(request: Request, quick: bool, voxels: dict[Path, Volume]) -> P
     projections = run.projections
     if run.unit == "counts" and quick:  # counts per pixel of the panel's size, as in the full picture
         projections = projections * np.float32(_pixel_area(recipe_views(recipe, system)) / _pixel_area(run.views))
-    word, (total,) = image_totals(display.part(run.projections), run.unit)
+    word, (total,) = image_totals(display.field(run.projections), run.unit)
     low, high = window = display.window(projections)
-    shown_part = display.part(projections)
+    shown_part = display.field(projections)
     picture = display.colored(fit_images(as_seen(shown_part), _SHOWN_PIXELS)[0], window)
     bar = [display.value_at(share, window) for share in np.linspace(0.0, 1.0, 256)]
     colors = display.colored([bar], window)

@@ -8,6 +8,7 @@ import itertools
 import json
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict
+from typing import Any
 
 import bpy
 import numpy as np
@@ -16,6 +17,7 @@ from mathutils import Quaternion
 from ...core import InputError, PinholeSystem
 from ...core.geometry.collimator import Construction
 from ...core.geometry.scanner import Finding, Scanner
+from ...core.geometry.system import chosen_indices
 from ...core.scanner_kinds import SCANNERS
 from ...core.workbook import ColumnMap, QuantityCells, SystemSource
 from ..blender import ids, objects, storage
@@ -305,17 +307,36 @@ def set_visible(camera: bpy.types.Object, visible: bool) -> None:
     _set_hidden([camera, *(c for c in camera.children if c.mphdrr_module.part in collimators.PARTS)], not visible)
 
 
-def show_modules(collection: bpy.types.Collection, first: int, last: int, mode: str = "ONLY") -> int:
-    """Show modules by their numbers, first to last, and return how many are visible now.
+def range_text(first: int, last: int) -> str:
+    """Return the text of a range of module numbers as earlier versions store it: 0 is the lowest or the highest number."""
+    return f"{first or ''}-{last or ''}" if first or last else ""
 
-    `mode` is ``"SHOW"`` or ``"HIDE"``, which leave the other modules, ``"ONLY"``, or ``"ALL"``, which needs no range.
+
+def suggested_ranges(owner: Any, context: bpy.types.Context, text: str) -> list[str]:
+    """Return the ranges of module numbers that a text field suggests (`quick_ranges`)."""
+    collection = active_scanner(context.scene)
+    text = collection.mphdrr_scanner.quick_ranges if collection else ""
+    return ["-".join(map(str, ends)) for ends in json.loads(text or "[]")]
+
+
+def visible_modules(collection: bpy.types.Collection) -> str:
+    """Return the numbers of the visible modules, such as "1-40, 45"; "" if all are visible."""
+    shown = [(o.mphdrr_module.number, not o.hide_viewport) for o in modules(collection)]
+    runs = (list(run) for is_visible, run in itertools.groupby(sorted(shown), lambda pair: pair[1]) if is_visible)
+    texts = ["-".join(dict.fromkeys(str(number) for number, _ in (run[0], run[-1]))) for run in runs]
+    return "" if all(is_visible for _, is_visible in shown) else ", ".join(texts) or "none"
+
+
+def show_modules(collection: bpy.types.Collection, text: str = "", mode: str = "ONLY") -> int:
+    """Show the modules whose numbers a text lists, such as "1-40, 45", and return how many are visible now; "": all.
+
+    `mode` is ``"SHOW"`` or ``"HIDE"``, which leave the other modules, ``"ONLY"``, or ``"ALL"``, which needs no text.
     """
     cameras_ = modules(collection)
-    chosen = {o for o in cameras_ if mode == "ALL" or first <= o.mphdrr_module.number <= last}
-    if not chosen:
-        numbers = [o.mphdrr_module.number for o in cameras_] or [0]
-        span = f"{min(numbers)} to {max(numbers)}"
-        raise InputError(f"no module between {first} and {last}: '{collection.name}' has {span}")
+    chosen = set(cameras_)
+    if text and mode != "ALL":
+        numbers = np.array([camera.mphdrr_module.number for camera in cameras_] or [0])
+        chosen = {cameras_[index] for index in chosen_indices(numbers, text, "modules")}
     for camera, parts in following.parts_of(collection, cameras_).items():
         if camera in chosen or mode == "ONLY":
             _set_hidden([camera, *parts], mode == "HIDE" or camera not in chosen)

@@ -47,7 +47,7 @@ def example(scene, dc_spect, tmp_path):
     run = mph.ProjectionRun(mph.Projector(volume.grid, views)(volume), system, views, volume)
     mph.write_run(run, tmp_path / "run.h5")
     rendering.show_run(scene, run, tmp_path / "run.h5", item)
-    scanner.show_modules(collection, 5, 41)
+    scanner.show_modules(collection, "5-41")
     update()
     return scene
 

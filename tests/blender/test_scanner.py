@@ -100,7 +100,7 @@ def test_moved_camera_and_edited_number_are_read(ring, ring_system):
 
 
 def test_hidden_or_parented_camera_is_read_where_it_is(scene, ring, ring_system):
-    scanner.show_modules(ring, 1, 1, "ONLY")
+    scanner.show_modules(ring, "1-1", "ONLY")
     update()
     bench = bpy.data.objects.new("Bench", None)
     scene.collection.objects.link(bench)
@@ -197,20 +197,20 @@ def test_modules_are_shown_by_range(scene, ring, ring_system):
                 shown.append(camera.mphdrr_module.number)
         return shown
 
-    assert scanner.show_modules(ring, 2, 4) == 3
+    assert scanner.show_modules(ring, "2-4") == 3
     assert visible() == [2, 3, 4]
-    scanner.show_modules(ring, 7, 9, "SHOW")
+    scanner.show_modules(ring, "7-9", "SHOW")
     assert visible() == [2, 3, 4, 7, 8]
-    scanner.show_modules(ring, 1, 3, "HIDE")
+    scanner.show_modules(ring, "1-3", "HIDE")
     assert visible() == [4, 7, 8]
     scanner.module(ring, 4).mphdrr_module.visible = False
     assert visible() == [7, 8]
     scanner.build_scanner(scene, ring_system, "Ring")
     assert visible() == [7, 8], "importing again keeps what is hidden"
-    scanner.show_modules(ring, 0, 0, "ALL")
+    scanner.show_modules(ring, mode="ALL")
     assert visible() == list(range(1, 9))
-    with pytest.raises(InputError, match="no module between 9 and 20"):
-        scanner.show_modules(ring, 9, 20)
+    with pytest.raises(InputError, match="no module 9-20; there are 1 to 8"):
+        scanner.show_modules(ring, "9-20")
 
 
 @pytest.mark.long

@@ -54,7 +54,7 @@ def test_show_and_look_through(scene, imported):
     bpy.ops.mphdrr.look_through_module(number=11)
     assert scene.camera.name == "Module 11"
     refused(bpy.ops.mphdrr.look_through_module, "no module 99", number=99)
-    refused(bpy.ops.mphdrr.show_modules, "no module between", first=100, last=120)
+    refused(bpy.ops.mphdrr.show_modules, "no module 100-120; there are 1 to", first=100, last=120)
 
 
 def test_import_again_keeps_the_pictures_behind_cameras(imported, small_workbook):

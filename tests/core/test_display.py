@@ -106,14 +106,17 @@ def test_every_image_has_its_sum_or_mean_and_the_bar_round_numbers(unit):
     word, values = image_totals(images, unit)
     assert word == ("sum" if unit in ("counts", "photons") else "mean")
     np.testing.assert_allclose(values, [getattr(image.astype(float), word)() for image in images], rtol=1e-12)
-    drawn, size = draw_sheet(images, [1, 2, 3], [0, 0, 0], unit), 128 / 5.5
-    texts = [f"{word} {value:.4g}" for value in values]
-    small = min(0.7 * size, 128 / max(width(text, 1.05) for text in texts))
-    for (row, column), text in zip(drawn.corners, texts, strict=True):
-        assert has_ink(drawn.picture[row : row + 128, column : column + 128], text, small)
-    bar = drawn.picture[:, drawn.corners[-1, 1] + 128 :]
+    size = 128 / 5.5
     assert 1.9 < images.max() < 2.0
-    assert all(has_ink(bar, text, size) for text in ("0", "1")) and not has_ink(bar, "9.9", size)
+    # In several rows the tiles have numbers alone, larger, and the word stands below the colour bar.
+    for rings, prefix, legend in (([0, 0, 0], f"{word} ", ""), ([0, 0, 1], "", f"tile: {word}")):
+        drawn = draw_sheet(images, [1, 2, 3], rings, unit)
+        texts = [f"{prefix}{value:.4g}" for value in values]
+        small = min(size, 128 / max(width(text, 1.05) for text in texts))
+        for (row, column), text in zip(drawn.corners, texts, strict=True):
+            assert has_ink(drawn.picture[row : row + 128, column : column + 128], text, small)
+        bar = drawn.picture[:, drawn.corners[:, 1].max() + 128 :]
+        assert all(has_ink(bar, text, size) for text in ("0", "1", legend)) and not has_ink(bar, "9.9", size)
 
 
 @pytest.mark.parametrize("shape", [(128, 128), (101, 126)])
@@ -122,7 +125,7 @@ def test_the_central_half_is_shown_with_its_own_totals_in_the_window_of_all(shap
     images[0, 0, 0] = 50.0
     n_v, n_u = shape
     middle = images[:, n_v // 4 : n_v - n_v // 4, n_u // 4 : n_u - n_u // 4]
-    display = Display(half=True)
+    display = Display(shown="half")
     assert np.array_equal(display.part(images), middle)
     assert np.array_equal(display.part(images[:, ::-1, ::-1]), middle[:, ::-1, ::-1]), "seen from any side"
     drawn, own = draw_sheet(images, [1, 2], [0, 0], "counts", display), Display(high=50.0)
@@ -130,6 +133,32 @@ def test_the_central_half_is_shown_with_its_own_totals_in_the_window_of_all(shap
     expected = draw_sheet(middle, [1, 2], [0, 0], "counts", own).picture
     np.testing.assert_array_equal(drawn.picture[:, :-200], expected[:, :-200])
     np.testing.assert_allclose(drawn.totals, middle.sum(axis=(1, 2), dtype=float))
+
+
+@pytest.mark.parametrize(
+    ("size", "reach", "eighths"), [(64, 8, 3), (64, 15, 4), (128, 33, 5), (50, 24, 8), (64, 31, 8)]
+)
+def test_the_object_fills_the_tiles_and_is_whole_in_all_of_them(size, reach, eighths):
+    """The object, of 1, reaches so many pixels from the middle in one of the images; the faint ground does not count."""
+    rng = np.random.default_rng(6)
+    images = rng.poisson(0.001, (3, size, size)).astype(np.float32) / 10
+    images[:, size // 2 - 4 : size // 2 + 4, size // 2 - 4 : size // 2 + 4] = 1.0
+    images[1, size // 2 - reach : size // 2, size // 2 - 3 : size // 2 + 3] = 1.0
+    shown = Display(shown="object").part(images)
+    cut = size * (8 - eighths) // 16
+    assert np.array_equal(shown, images[:, cut : size - cut, cut : size - cut])
+    drawn, whole = (
+        draw_sheet(images, [1, 2, 3], [0] * 3, "counts", Display(shown="object")),
+        draw_sheet(images, [1, 2, 3], [0] * 3, "counts"),
+    )
+    np.testing.assert_array_equal(drawn.totals, whole.totals)
+    assert drawn.window == whole.window and drawn.share == (1 - 2 * cut / size,) * 2 and not drawn.half
+
+
+@pytest.mark.parametrize("value", [0.0, 1.0, np.nan])
+def test_images_without_an_object_are_shown_whole(value):
+    images = np.full((2, 30, 40), value, np.float32)
+    assert Display(shown="object").part(images).shape == images.shape
 
 
 def test_images_too_small_for_a_total_have_none():

@@ -107,7 +107,7 @@ class Worker(threading.Thread):
         self.warnings: list[str] = []
         self.cancel = threading.Event()
         self.steps: Finishing | None = None
-        self._can_stop = False
+        self._can_stop = self.is_asked_about = False
 
     def run(self) -> None:
         """Do the work and keep its result or its error, with the warnings."""
@@ -372,6 +372,8 @@ class JobOperator:
             _current = None
         elif self._run in _waiting:
             _waiting.remove(self._run)
+        if self._run is not None and self._run.is_asked_about:
+            windows.close_menus()
         _redraw(context)
 
     def _failed(self, error: BaseException) -> set[str]:
@@ -436,6 +438,7 @@ class MPHDRR_OT_cancel_job(reports.Reported, bpy.types.Operator):
             menu.layout.operator("mphdrr.cancel_job", text="Discard", icon="TRASH").number = worker.number
 
         context.window_manager.popup_menu(draw, title=f"{worker.label}: Stop?", icon="QUESTION")
+        worker.is_asked_about = True
         return {"CANCELLED"}
 
     def act(self, context: bpy.types.Context) -> None:

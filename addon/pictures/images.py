@@ -38,6 +38,8 @@ _LABELS = "mphdrr_labels"  # custom property of the mosaic: the label of each ti
 _TILES = "mphdrr_tiles"  # custom property of the mosaic: its modules, its unit, and the position of each tile
 _VIEWS = "mphdrr_views"  # custom property of the mosaic: the run's views, as arrays of `Views`, and their ROI radii
 
+_lost: dict[bpy.types.Area, str] = {}  # names of the pictures that Image Editors showed before an undo or redo
+
 
 @dataclass(frozen=True)
 class Pictures:
@@ -322,6 +324,21 @@ def _editors(context: bpy.types.Context) -> list[tuple[bpy.types.Window, bpy.typ
             if area.type == "IMAGE_EDITOR" and space.mode == "VIEW" and (space.image is None or _KEY in space.image):
                 editors.append((window, area))
     return sorted(editors, key=lambda editor: editor[1].width * editor[1].height)
+
+
+def before_undo(*_: Any) -> None:
+    """Note the pictures in the free Image Editors: those whose image an undo or redo makes anew would show none."""
+    _lost.update({area: area.spaces.active.image.name for _, area in _editors(bpy.context) if area.spaces.active.image})
+
+
+def after_undo(*_: Any) -> None:
+    """Show pictures again in the editors that had them, when an undo or redo has brought them back."""
+    for window, area in _editors(bpy.context):
+        if (image := bpy.data.images.get(_lost.get(area, ""))) is not None:
+            del _lost[area]
+            if area.spaces.active.image != image:
+                area.spaces.active.image = image
+                _fit(window, area)
 
 
 def editor_size(context: bpy.types.Context) -> tuple[int, int, float] | None:

@@ -19,7 +19,6 @@ from bpy.props import (
     StringProperty,
 )
 
-from ..core.errors import InputError
 from ..core.geometry.system import PinholeSystem
 from .blender import choices, ids
 from .blender.file_properties import path_property
@@ -102,7 +101,6 @@ class ScannerProperties(bpy.types.PropertyGroup):
     workbook: path_property("Workbook", "Workbook that was last read or written")
     sha256: StringProperty(name="SHA-256", description="Checksum of the workbook when it was read")
     n_modules: IntProperty(name="Modules", description="Number of modules when the scanner was imported", min=0)
-    quick_ranges: StringProperty(name="Ranges", description="Module ranges with a button, JSON", options={"HIDDEN"})
     source: StringProperty(name="Source", description="Workbook that the numbers come from, JSON", options={"HIDDEN"})
     plate_thickness: FloatProperty(
         name="Plate", description="Thickness of the aperture plates in mm", min=0.0, update=on_edit("scanner")
@@ -155,21 +153,6 @@ class ScannerProperties(bpy.types.PropertyGroup):
     calibration: StringProperty(name="Calibration", description="Result of the last calibration, lines as JSON")
 
 
-def _visible_modules(self: GeometryProperties) -> str:
-    """Return the numbers of the visible modules as text."""
-    collection = scanner.active_scanner(self.id_data)
-    return scanner.visible_modules(collection) if collection else ""
-
-
-def _show_modules(self: GeometryProperties, text: str) -> None:
-    """Show only the modules that a text lists; keep the reason where it lists none."""
-    self.visible_problem = ""
-    try:
-        scanner.show_modules(scanner.required_scanner(self.id_data), text)
-    except InputError as error:
-        self.visible_problem = str(error)
-
-
 class GeometryProperties(bpy.types.PropertyGroup):
     """State of the Geometry panel; `Scene.mphdrr_geometry`."""
 
@@ -180,7 +163,7 @@ class GeometryProperties(bpy.types.PropertyGroup):
     all_at_once: BoolProperty(name="All Modules", description="Show and change all modules, not the active one alone")
     visible: StringProperty(
         name="Visible Modules", description="Numbers of the modules that are shown, such as 1-40, 45; empty: all",
-        get=_visible_modules, set=_show_modules, search=scanner.suggested_ranges, search_options={"SUGGESTION"},
+        get=scanner.visible_modules, set=scanner.show_visible_modules, search=scanner.suggested_ranges,
     )  # fmt: skip
     visible_problem: StringProperty(name="Problem", description="Reason why modules stay hidden", options={"SKIP_SAVE"})
     # Lines that `sight_lines.py` draws in the 3D views.

@@ -108,9 +108,7 @@ CONTEXT_MENUS = bpy.types.VIEW3D_MT_object_context_menu, bpy.types.OUTLINER_MT_o
 MENUS += [(menu, menus.draw_in_context_menu) for menu in CONTEXT_MENUS]
 
 _BEFORE_UNDO = (framing.before_undo, images.before_undo)
-_AFTER_UNDO = (
-    images.after_undo, recoloring.check, runs.after_update, live_scanner.after_undo, slices.after_undo, framing.after_undo,
-)  # fmt: skip
+_AFTER_UNDO = (recoloring.check, runs.after_update, live_scanner.after_undo, slices.after_undo, framing.after_undo)
 _AFTER_UPDATE = (
     live_scanner.after_update, selection.after_update, planes.after_update, frustums.after_update, slices.after_update,
 )  # fmt: skip
@@ -126,8 +124,8 @@ _HANDLERS: dict[str, tuple[Any, ...]] = {
     "frame_change_post": _AFTER_FRAME,
     "undo_pre": _BEFORE_UNDO,
     "redo_pre": _BEFORE_UNDO,
-    "undo_post": (*_AFTER_UNDO, preview.after_update),
-    "redo_post": (*_AFTER_UNDO, preview.after_update),
+    "undo_post": (images.after_undo, *_AFTER_UNDO, preview.after_update),
+    "redo_post": (images.after_undo, *_AFTER_UNDO, preview.after_update),
     "render_init": (figures.before_render,),
     "save_pre": (storage.before_save, slices.before_save),
     "save_post": (storage.after_save,),

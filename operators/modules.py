@@ -14,8 +14,6 @@ class MPHDRR_OT_show_modules(selection.OnScanner, bpy.types.Operator):
     """Show or hide modules with their collimators and crystals, in the viewport and in renders."""
 
     modules: StringProperty(name="Modules", description="Numbers of modules, such as 1-40, 45; empty: all")
-    first: IntProperty(name="First", description="First number, where Modules is empty", options={"HIDDEN"})
-    last: IntProperty(name="Last", description="Last number, where Modules is empty", options={"HIDDEN"})
     mode: EnumProperty(
         name="Mode", description="What to do with these modules and the others", default="ONLY",
         items=[
@@ -27,8 +25,7 @@ class MPHDRR_OT_show_modules(selection.OnScanner, bpy.types.Operator):
     )  # fmt: skip
 
     def change(self, context: bpy.types.Context, collection: bpy.types.Collection) -> str:
-        text = self.modules or scanner.range_text(self.first, self.last)
-        return f"{ids.counted(scanner.show_modules(collection, text, self.mode), 'module')} visible"
+        return f"{ids.counted(scanner.show_modules(collection, self.modules, self.mode), 'module')} visible"
 
 
 class MPHDRR_OT_isolate_ring(selection.OnModules, bpy.types.Operator):

@@ -40,7 +40,7 @@ def _draw_totals(layout: bpy.types.UILayout, context: bpy.types.Context) -> None
         return
     column = layout.column(align=True)
     text = iface("{name}, central half ({unit})") if summary["half"] else "{name} ({unit})"
-    column.label(text=text.format(name=camera.name, unit=summary["unit"]), translate=False)
+    column.label(text=text.format(name=camera.name, unit=tiles.unit()).removesuffix(" ()"), translate=False)
     numbers = column.split(factor=0.4)
     numbers.active = False
     total, maximum = (f"{summary[name][index]:.6g}" for name in ("totals", "maxima"))

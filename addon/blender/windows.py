@@ -34,12 +34,6 @@ def redraw_sidebars() -> None:
                 region.tag_redraw()
 
 
-def close_menus() -> None:
-    """Close open menus and pop-ups: Blender does so where a window gets a screen, even its own."""
-    for window in bpy.context.window_manager.windows:
-        window.screen = window.screen
-
-
 def draw_texts(texts: Iterable[tuple[str, float, float, tuple[float, ...]]], size: float) -> None:
     """Write texts (text, x, y, colour) with shadows over a region; positions and font size in pixels."""
     blf.size(0, size)

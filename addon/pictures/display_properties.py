@@ -25,11 +25,6 @@ _PLANES = (
 )
 
 
-def _shown_part(self: bpy.types.PropertyGroup) -> int:
-    """Return the number of the part that is shown."""
-    return _PARTS[1 if self.half else 2 * self.whole][3]
-
-
 def _show_part(self: bpy.types.PropertyGroup, number: int) -> None:
     """Show the part of this number."""
     self.half, self.whole = (number == part[3] for part in _PARTS[1:])
@@ -52,7 +47,8 @@ class DisplayProperties(bpy.types.PropertyGroup):
         name="High", description="Number with the last colour", default=1.0, update=updates.on_edit("display")
     )
     shown: EnumProperty(name="Show", description="Part of each image that the pictures show; the exact images stay whole",
-                        items=_PARTS, get=_shown_part, set=_show_part)  # fmt: skip
+                        items=_PARTS, get=lambda self: _PARTS[1 if self.half else 2 * self.whole][3],
+                        set=_show_part)  # fmt: skip
     half: BoolProperty(name="Central Half", options={"HIDDEN"}, update=updates.on_edit("display"))
     whole: BoolProperty(name="Whole Images", options={"HIDDEN"}, update=updates.on_edit("display"))
     planes: EnumProperty(name="Planes", description="Modules whose projections stand in the scene",

@@ -38,7 +38,7 @@ _LABELS = "mphdrr_labels"  # custom property of the mosaic: the label of each ti
 _TILES = "mphdrr_tiles"  # custom property of the mosaic: its modules, its unit, and the position of each tile
 _VIEWS = "mphdrr_views"  # custom property of the mosaic: the run's views, as arrays of `Views`, and their ROI radii
 
-_lost: dict[bpy.types.Area, str] = {}  # names of the pictures that Image Editors showed before an undo or redo
+_shown: dict[bpy.types.Area, str] = {}  # names of the pictures that Image Editors showed before an undo or redo
 
 
 @dataclass(frozen=True)
@@ -201,7 +201,7 @@ def projection_name(number: int, numbers: list[int]) -> str:
 def _color(projections: NDArray[np.float32], display: Display, progress: Progress | None = None) -> list[bytes]:
     """Return the pictures of projections (M, n_v, n_u) in one window, as PNG files; `progress` counts them."""
     window = display.window(projections)
-    shown_pictures = block_means(as_seen(display.field(projections)), _MAX_PIXELS)
+    shown_pictures = block_means(as_seen(display.part(projections)), _MAX_PIXELS)
     return _make_all(lambda picture: png_bytes(display.colored(picture, window), _PNG_LEVEL), shown_pictures, progress)
 
 
@@ -328,17 +328,17 @@ def _editors(context: bpy.types.Context) -> list[tuple[bpy.types.Window, bpy.typ
 
 def before_undo(*_: Any) -> None:
     """Note the pictures in the free Image Editors: those whose image an undo or redo makes anew would show none."""
-    _lost.update({area: area.spaces.active.image.name for _, area in _editors(bpy.context) if area.spaces.active.image})
+    pictures = ((area, area.spaces.active.image) for _, area in _editors(bpy.context))
+    _shown.update({area: image.name for area, image in pictures if image is not None})
 
 
 def after_undo(*_: Any) -> None:
     """Show pictures again in the editors that had them, when an undo or redo has brought them back."""
     for window, area in _editors(bpy.context):
-        if (image := bpy.data.images.get(_lost.get(area, ""))) is not None:
-            del _lost[area]
-            if area.spaces.active.image != image:
-                area.spaces.active.image = image
-                _fit(window, area)
+        image = bpy.data.images.get(_shown.get(area, ""))
+        if image not in (None, area.spaces.active.image):
+            area.spaces.active.image = image
+            _fit(window, area)
 
 
 def editor_size(context: bpy.types.Context) -> tuple[int, int, float] | None:

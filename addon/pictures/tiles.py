@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ...core.errors import InputError
-from ...core.runs.display import Display
+from ...core.runs.display import Display, unit_text
 from ..blender import ids, windows
 from ..scanner import scanner, selection
 from . import images
@@ -109,6 +109,11 @@ def value_at(image: bpy.types.Image | None, x: float, y: float) -> tuple[str, fl
     values = images.projection_array(exact)
     column, row = hit[0].pixel_at(hit[1], (values.shape[0], values.shape[1]))
     return f"{exact.name}, column {column}, row {row}", float(values[row, column])
+
+
+def unit() -> str:
+    """Return the unit of the shown run's images as people write it."""
+    return unit_text((images.tiles(bpy.data.images.get(ids.MOSAIC)) or {}).get("unit", ""))
 
 
 def pick_module(context: bpy.types.Context, x: float, y: float) -> str | None:

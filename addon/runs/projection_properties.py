@@ -72,7 +72,7 @@ def settings_recipe(
     """
     values = {**recipe_values(get), **extra}
     if is_set("first") or is_set("last"):
-        values["system.modules"] = scanner.range_text(get("first"), get("last")) or None
+        values["system.modules"] = _range_text(get) or None
     if fixed_pixels := collection and scanner.fixed_pixels(collection):
         pixels = {"height": fixed_pixels[0], "width": fixed_pixels[1]}
         names = [name for name, setting in PROPERTIES.items() if setting.key.startswith("detector.")]
@@ -84,6 +84,11 @@ def settings_recipe(
         and values[setting.key] != setting.default
     ]
     return fitting_recipe(values, set_keys)
+
+
+def _range_text(get: Callable[[str], Any]) -> str:
+    """Return the range of modules of an earlier version's file or script as text; 0 is the lowest or the highest number."""
+    return f"{get('first') or ''}-{get('last') or ''}" if get("first") or get("last") else ""
 
 
 def set_panel(settings: ProjectionProperties, recipe: Recipe) -> None:
@@ -171,7 +176,7 @@ def _volume_chosen(self: ProjectionProperties, context: bpy.types.Context) -> No
 
 def _chosen_modules(self: ProjectionProperties) -> str:
     """Return the numbers of the modules that are projected, also those of an earlier version's range."""
-    return scanner.range_text(self.first, self.last) or str(self.numbers)
+    return _range_text(lambda name: getattr(self, name)) or str(self.numbers)
 
 
 def _choose_modules(self: ProjectionProperties, text: str) -> None:
@@ -187,7 +192,7 @@ class ProjectionProperties(ProjectionSettings, bpy.types.PropertyGroup):
                             volumes.is_volume(item) and volumes.quantity_of(item) not in MAPS)  # fmt: skip
     modules: StringProperty(
         name="Modules", description="Numbers of the modules to project into, such as 1-40, 45; empty: all",
-        get=_chosen_modules, set=_choose_modules, search=scanner.suggested_ranges, search_options={"SUGGESTION"},
+        get=_chosen_modules, set=_choose_modules, search=scanner.suggested_ranges,
     )  # fmt: skip
     numbers: StringProperty(name="Numbers", description="The text in Modules", options={"HIDDEN"})
     fitted: StringProperty(name="Fitted", description="Model chosen for the volume's quantity", options={"HIDDEN"})

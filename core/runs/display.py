@@ -70,13 +70,12 @@ class Display:
         if self.scale == "log" and self.low is not None and self.low <= 0:
             raise InputError(f"low = {self.low:g}: expected more than 0 on the logarithmic scale")
 
-    def field(self, images: Floats32) -> Floats32:
-        """Return the shown field of view of images (..., n_v, n_u): their middle half, or all of them."""
-        return _middle(images, 4 if self.shown == "half" else 8)
-
-    def part(self, images: Floats32) -> Floats32:
-        """Return the part of images (..., n_v, n_u) that a mosaic shows, the same of all images."""
-        return _middle(images, _eighths_of_object(images)) if self.shown == "object" else self.field(images)
+    def part(self, images: Floats32, in_mosaic: bool = False) -> Floats32:
+        """Return the part of images (..., n_v, n_u) that is shown, the same of all images."""
+        fits = in_mosaic and self.shown == "object"
+        eighths = 4 if self.shown == "half" else _eighths_of_object(images) if fits else 8
+        top, left = (n * (8 - eighths) // 16 for n in images.shape[-2:])
+        return images[..., top : images.shape[-2] - top, left : images.shape[-1] - left]
 
     def window(self, values: ArrayLike) -> tuple[float, float]:
         """Return the numbers with the first and the last colour if `values` are shown."""
@@ -126,13 +125,6 @@ class Display:
         """Return colours (..., 3), 8-bit sRGB, of `values` (...), in the given window or in their automatic one."""
         shares = self.shares(values, self.window(values) if window is None else window)
         return _table(self.colors)[np.rint(shares * 255).astype(np.uint8)]
-
-
-def _middle(images: Floats32, eighths: int) -> Floats32:
-    """Return the middle of images (..., n_v, n_u): so many eighths of both sides."""
-    n_v, n_u = images.shape[-2:]
-    top, left = (n * (8 - eighths) // 16 for n in (n_v, n_u))
-    return images[..., top : n_v - top, left : n_u - left]
 
 
 def _eighths_of_object(images: Floats32) -> int:

@@ -117,13 +117,13 @@ def draw_sheet(
     """
     display = display or Display()
     window = display.window(projections)
-    visible = display.part(projections)
-    counted = display.field(projections)  # an automatic part changes no number
+    visible = display.part(projections, in_mosaic=True)
+    counted = display.part(projections)  # an automatic part changes no number
     word, values = image_totals(counted, unit)
     images = display.colored(fit_images(as_seen(visible), pixels), window)
     tiles = tile_places(np.asarray(rings))
     n_v, n_u = tile = images.shape[1:3]
-    size = max(_SMALL_TEXT, min(n_v, n_u) / 5.5)
+    size = max(_SMALL_TEXT, min(n_v, n_u) / 5)
     gap = round(size / 6)
     corners = gap + tiles * (np.array(tile) + gap)
     height, width = corners.max(axis=0) + tile + gap
@@ -136,8 +136,8 @@ def draw_sheet(
         _write(picture, str(number), row + gap // 2, column + gap, size)
         if small >= _SMALL_TEXT:
             _write(picture, total_text, row + n_v - math.ceil(1.1 * small), column + gap, small)
-    legend = f"tile: {word}" if is_tall and small >= _SMALL_TEXT else ""
-    bar = _color_bar(display, window, unit, legend, height, max(size, height / 25))
+    note = f"tile: {word}" if is_tall and small >= _SMALL_TEXT else ""
+    bar = _color_bar(display, window, unit, note, height, max(size, height / 25))
     with_bar = np.concatenate([picture, bar], axis=1)
     share = visible.shape[2] / projections.shape[2], visible.shape[1] / projections.shape[1]
     maxima = counted.max(axis=(1, 2))
@@ -218,20 +218,18 @@ def tile_places(rings: Integers, columns: int = COLUMNS) -> Integers:
     return tiles
 
 
-def _color_bar(
-    display: Display, window: tuple[float, float], unit: str, legend: str, height: int, size: float
-) -> Bytes:
-    """Return a colour bar (height, width, 3) with its numbers, its unit above it and a legend of the tiles below it."""
+def _color_bar(display: Display, window: tuple[float, float], unit: str, note: str, height: int, size: float) -> Bytes:
+    """Return a colour bar (height, width, 3) with its numbers, its unit above it and a note below it."""
     unit = unit_text(unit)
     line, em = math.ceil(1.1 * size), round(size)
-    top, bottom = 2 * line, height - (3 * line // 2 if legend else 0) - line
+    top, bottom = 2 * line, height - (3 * line // 2 if note else 0) - line
     values = display.marks(window, min(5, max(1, (bottom - top) // line)))  # as many steps as there is room for
     marks = [(float(display.shares(value, window)), f"{value:.4g}") for value in values]
     widths = [1.5 * em + letters.width(text, size) for _, text in marks]
-    columns = max(letters.width(unit, size), letters.width(legend, size), *widths)
+    columns = max(letters.width(unit, size), letters.width(note, size), *widths)
     bar = np.full((height, math.ceil(columns) + em, 3), _BORDER, np.uint8)
     _write(bar, unit, line // 3, em // 2, size, shade=1.0)
-    _write(bar, legend, height - line, em // 2, size, shade=1.0)
+    _write(bar, note, height - line, em // 2, size, shade=1.0)
     ramp = [display.value_at(share, window) for share in np.linspace(1.0, 0.0, bottom - top)]
     bar[top:bottom, em // 2 : em // 2 + em] = display.colored(ramp, window)[:, None]
     for share, text in marks:

@@ -186,7 +186,7 @@ def test_each_edit_changes_the_selected_one(scene, a_and_b):
         panel = scanner.active_scanner(scene)
         panel.mphdrr_scanner.detector_thickness = 7.5
         selection.active_module(bpy.context).mphdrr_module.pinhole_diameter = 3.5
-        bpy.ops.mphdrr.show_modules(first=4, last=5, mode="ONLY")
+        bpy.ops.mphdrr.show_modules(modules="4-5", mode="ONLY")
         bpy.ops.mphdrr.duplicate_modules(count=1, angle=np.radians(14))
         select(scanner.module(mine, 5))
         bpy.ops.mphdrr.remove_modules()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import subprocess
 import sys
 
@@ -55,8 +54,8 @@ def test_scanner_has_a_collection_per_ring_and_a_camera_per_module(scene, dc_spe
     assert [o.name for o in found[:2]] == ["Module 01", "Module 02"]
     assert [o.mphdrr_module.number for o in found] == list(range(1, 81))
     assert scene.unit_settings.scale_length == pytest.approx(0.001)
-    assert scanner.quick_ranges(dc_spect) == [(1, 40), (21, 60), (41, 80)]
-    assert json.loads(collection.mphdrr_scanner.quick_ranges) == [[1, 40], [21, 60], [41, 80]]
+    assert scanner.quick_ranges(dc_spect.numbers, dc_spect.rings()) == ["1-40", "21-60", "41-80"]
+    assert scanner.suggested_ranges(None, bpy.context, "") == ["1-40", "21-60", "41-80"]
     assert sum(o.type == "MESH" for o in collection.all_objects) == 161
     meshes = {o.data for o in collection.all_objects if o.type == "MESH"}
     assert len(meshes) == 161, "each has its own, which is reshaped in place"
@@ -211,6 +210,29 @@ def test_modules_are_shown_by_range(scene, ring, ring_system):
     assert visible() == list(range(1, 9))
     with pytest.raises(InputError, match="no module 9-20; there are 1 to 8"):
         scanner.show_modules(ring, "9-20")
+
+
+def test_the_modules_that_are_visible_are_one_text(scene, ring):
+    state = scene.mphdrr_geometry
+
+    def visible():
+        return [camera.mphdrr_module.number for camera in scanner.modules(ring) if not camera.hide_viewport]
+
+    assert state.visible == ""
+    state.visible = "2-4, 7"
+    assert visible() == [2, 3, 4, 7] and state.visible == "2-4, 7"
+    scanner.module(ring, 3).mphdrr_module.visible = False
+    assert state.visible == "2, 4, 7", "what is shown, however it came so"
+    for text, reason in (
+        ("9-20", "no module 9-20; there are 1 to 8"),
+        ("a", "expected numbers such as 1-40 or 1-20,41"),
+    ):
+        state.visible = text
+        assert reason in state.visible_problem and visible() == [2, 4, 7]
+    state.visible = ""
+    assert visible() == list(range(1, 9)) and (state.visible, state.visible_problem) == ("", "")
+    scanner.show_modules(ring, mode="HIDE")
+    assert state.visible == "none"
 
 
 @pytest.mark.long

@@ -137,7 +137,7 @@ def draw_sheet(
         if small >= _SMALL_TEXT:
             _write(picture, total_text, row + n_v - math.ceil(1.1 * small), column + gap, small)
     note = f"tile: {word}" if is_tall and small >= _SMALL_TEXT else ""
-    bar = _color_bar(display, window, unit, note, height, max(size, height / 25))
+    bar = _color_bar(display, window, unit, note, height, max(0.9 * size, height / 25))
     with_bar = np.concatenate([picture, bar], axis=1)
     share = visible.shape[2] / projections.shape[2], visible.shape[1] / projections.shape[1]
     maxima = counted.max(axis=(1, 2))

@@ -324,6 +324,7 @@ def test_stale_runs_are_said_and_compared_in_the_window(window, work_folder):
     said = [seen[when] for when in ("loaded", "moved", "undone", "moved again", "rendered", "chosen")]
     assert said == [[], moved, [], moved, [], moved]
     assert seen["handler ms"] < 0.1, "of each update of the scene, selecting included"
+    assert seen["pictures"] == [None, *["mphDRR mosaic"] * 3], "undo and redo of the first run, and of the second"
     assert seen["shown"] == "As imported" and len(seen["runs"]) == 2
     assert seen["image"] == "mphDRR difference"
     screen = pixels(seen["screen"])

@@ -8,7 +8,7 @@ from PIL import Image
 
 import mphdrr.core as mph
 from mphdrr.core.runs.display import COLORS, SCALES, Display
-from mphdrr.core.runs.letters import text_ink, width
+from mphdrr.core.runs.letters import text_ink, width, wrap_text
 from mphdrr.core.runs.mosaic import draw_sheet, image_totals, write_png
 
 from .conftest import refused
@@ -116,9 +116,8 @@ def test_every_image_has_its_sum_or_mean_and_the_bar_round_numbers(unit):
         for (row, column), text in zip(drawn.corners, texts, strict=True):
             assert has_ink(drawn.picture[row : row + 128, column : column + 128], text, small)
         bar = drawn.picture[:, drawn.corners[:, 1].max() + 128 :]
-        assert all(has_ink(bar, text, size) for text in filter(None, ("0", "1", legend))) and not has_ink(
-            bar, "9.9", size
-        )
+        assert all(has_ink(bar, text, 0.9 * size) for text in ("0", "1", *filter(None, [legend])))
+        assert not has_ink(bar, "9.9", 0.9 * size)
 
 
 @pytest.mark.parametrize("shape", [(128, 128), (101, 126)])
@@ -161,6 +160,12 @@ def test_the_object_fills_the_tiles_and_is_whole_in_all_of_them(size, reach, eig
 def test_images_without_an_object_are_shown_whole(value):
     images = np.full((2, 30, 40), value, np.float32)
     assert Display(shown="object").part(images, in_mosaic=True).shape == images.shape
+
+
+def test_a_unit_of_length_stays_with_its_number():
+    lines = wrap_text("CGLS, 3 iterations, 128 x 128 x 128 voxels of 1.17 mm", lambda text: len(text) <= 50)
+    assert lines == ["CGLS, 3 iterations, 128 x 128 x 128 voxels of", "1.17 mm"]
+    assert wrap_text("", lambda text: False) == [""]
 
 
 def test_images_too_small_for_a_total_have_none():

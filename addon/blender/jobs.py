@@ -31,7 +31,6 @@ _STEP_TIME = 0.02  # s of the main thread for finishing a job, after which the w
 _SLOW_SHARE, _MAX_STEP_TIME = 0.1, 0.05
 _STOP_TIMEOUT = 0.2  # s that `stop` waits for a worker thread; a slower one ends by itself, and its result is dropped
 _STATUS_UNITS = 16  # the job's width in the status bar
-_COUNTED = 100  # steps of a stage from which on it is told in per cent: the texts fit into a narrow sidebar
 _ESTIMATE_AFTER = 1.0  # s of a stage after which the remaining time is estimated
 
 Finishing = Generator[tuple[str, int, int] | None, None, str]
@@ -131,7 +130,8 @@ class Worker(threading.Thread):
             return f"{stage_text}: stopping"
         if self.total < 2:
             return f"{stage_text}, {elapsed:.0f} s" if elapsed > _ESTIMATE_AFTER else stage_text
-        stage_text += f" {self.done} of {self.total}" if self.total < _COUNTED else f" {100 * self.share:.0f} %"
+        # In per cent where a text with two numbers would not fit into a narrow sidebar.
+        stage_text += f" {self.done} of {self.total}" if self.total < 100 else f" {100 * self.share:.0f} %"
         if elapsed < _ESTIMATE_AFTER or not 0 < self.done < self.total:
             return stage_text
         remaining = elapsed / self.done * (self.total - self.done)

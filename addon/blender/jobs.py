@@ -124,13 +124,12 @@ class Worker(threading.Thread):
 
     @property
     def text(self) -> str:
-        """The stage in words, with its progress and the time that it has taken or still takes."""
+        """The stage in words, with its progress and the time that it has taken or still takes; short, for a sidebar."""
         stage_text, elapsed = self.stage[:1].upper() + self.stage[1:], time.monotonic() - self.stage_start
         if self.cancel.is_set():
             return f"{stage_text}: stopping"
         if self.total < 2:
             return f"{stage_text}, {elapsed:.0f} s" if elapsed > _ESTIMATE_AFTER else stage_text
-        # In per cent where a text with two numbers would not fit into a narrow sidebar.
         stage_text += f" {self.done} of {self.total}" if self.total < 100 else f" {100 * self.share:.0f} %"
         if elapsed < _ESTIMATE_AFTER or not 0 < self.done < self.total:
             return stage_text

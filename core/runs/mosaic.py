@@ -35,7 +35,7 @@ COLUMNS = 20
 """Default number of images in a row."""
 _BORDER = 64
 """Grey between the images of a sheet, 0 to 255."""
-_SMALLEST = 64
+_SMALLEST = 96
 """Smallest side of an image in a sheet, pixels."""
 _SMALL_TEXT = 11.0
 """Smallest size of text, pixels."""
@@ -127,7 +127,7 @@ def draw_sheet(
     gap = round(size / 6)
     corners = gap + tiles * (np.array(tile) + gap)
     height, width = corners.max(axis=0) + tile + gap
-    picture = np.full((height, width, 3), _BORDER, np.uint8)
+    picture = np.full((max(height, math.ceil(5 * size)), width, 3), _BORDER, np.uint8)  # room for the colour bar
     is_tall = tiles[:, 0].max() > 0  # the word stands once, below the colour bar, where there is room
     texts = [f"{'' if is_tall else word} {value:.4g}".strip() for value in values]
     small = min(n_u / max(letters.width(total_text, 1.05) for total_text in texts), n_v / 5, size)
@@ -137,7 +137,7 @@ def draw_sheet(
         if small >= _SMALL_TEXT:
             _write(picture, total_text, row + n_v - math.ceil(1.1 * small), column + gap, small)
     note = f"tile: {word}" if is_tall and small >= _SMALL_TEXT else ""
-    bar = _color_bar(display, window, unit, note, height, max(0.9 * size, height / 25))
+    bar = _color_bar(display, window, unit, note, len(picture), max(0.9 * size, height / 25))
     with_bar = np.concatenate([picture, bar], axis=1)
     share = visible.shape[2] / projections.shape[2], visible.shape[1] / projections.shape[1]
     maxima = counted.max(axis=(1, 2))

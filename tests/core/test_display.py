@@ -65,6 +65,7 @@ def test_numbers_outside_a_window_have_its_ends_colours_and_no_number_has_the_fi
     [
         ({"colors": "jet"}, "colors 'jet': expected one of inferno"),
         ({"scale": "cube"}, "scale 'cube': expected one of linear"),
+        ({"shown": "all"}, "shown 'all': expected one of object, half, whole"),
         ({"low": 3, "high": 3}, "expected low to be less than high"),
         ({"scale": "log", "low": 0}, "expected more than 0 on the logarithmic scale"),
         ({"high": np.inf}, "expected a finite number"),
@@ -74,7 +75,7 @@ def test_displays_that_cannot_be(settings, said):
     refused(lambda: Display(**settings), said)
 
 
-@pytest.mark.parametrize(("shape", "factor"), [((70, 80), 1.0), ((20, 30), 3.0), ((200, 160), 0.5)])
+@pytest.mark.parametrize(("shape", "factor"), [((100, 96), 1.0), ((20, 30), 4.0), ((200, 160), 0.5)])
 def test_every_image_stands_in_its_rings_row_as_the_pinhole_sees_it(shape, factor):
     rings = np.repeat([0, 1], [3, 5])
     images = np.random.default_rng(2).random((8, *shape), np.float32) * 70
@@ -90,7 +91,7 @@ def test_every_image_stands_in_its_rings_row_as_the_pinhole_sees_it(shape, facto
         assert np.all(between == between[0]), "the images do not touch"
         if factor == 1:  # all but the number and the total in the corners
             wanted = Display().colored(mph.as_seen(images[m]), drawn.window)
-            np.testing.assert_array_equal(own[20:-16], wanted[20:-16])
+            np.testing.assert_array_equal(own[26:-24], wanted[26:-24])
 
 
 def has_ink(picture, text, size):
@@ -169,11 +170,11 @@ def test_a_unit_of_length_stays_with_its_number():
 
 
 def test_images_too_small_for_a_total_have_none():
-    images = np.zeros((2, 64, 64), np.float32)
+    images = np.zeros((2, 24, 100), np.float32)
     images[0, 20, 20] = 123456.0
     drawn = draw_sheet(images, [1, 2], [0, 0], "counts")
     (row, column) = drawn.corners[1]
-    assert not (drawn.picture[row + 20 : row + 64, column : column + 64] == 255).any()
+    assert not (drawn.picture[row + 16 : row + 24, column : column + 100] == 255).any()
 
 
 def test_a_run_without_counts_can_be_shown(tmp_path):

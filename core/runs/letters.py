@@ -2,6 +2,7 @@
 
 import base64
 import functools
+import re
 import zlib
 from collections.abc import Callable
 from pathlib import Path
@@ -38,9 +39,9 @@ def width(text: str, size: float) -> float:
 
 
 def wrap_text(text: str, fits: Callable[[str], bool]) -> list[str]:
-    """Return a text as lines for which `fits` returns True, broken at spaces."""
+    """Return a text as lines for which `fits` returns True, broken at spaces, but not before a unit of length."""
     lines = [""]
-    for word in text.split():
+    for word in re.split(r"\s+(?!mm\b)", text.strip()):
         longer = f"{lines[-1]} {word}".strip()
         if lines[-1] and not fits(longer):
             lines.append(word)

@@ -11,15 +11,19 @@ from ..core.example import EULER_DEGREES, EXAMPLE
 from ..core.geometry.scanner import Scanner
 from ..core.progress import Progress, stages_of
 from ..core.runs.display import Display
-from .blender import jobs
+from .blender import ids, jobs, objects
 from .figures import studio
 from .phantoms import phantom_properties, phantoms
 from .pictures import images
 from .runs import rendering, runs
-from .scanner import scanner
+from .scanner import collimators, following, scanner, selection
 
 _VOXELS, _PIXELS = 140, 128  # voxels at most half of the reconstruction's
-_VIEW = Euler((1.05, 0.0, 0.95))  # view from above, into the opening of the rings
+# Module that is active, direction of the view, and radius shown, mm: the opening of the rings, with the phantom a third of
+# the view's height; and a tube whose panel is behind the torso, so that both are seen.
+_SHOWN = {False: (32, Euler((1.05, 0.0, 1.3)), 104.0), True: (18, Euler((1.2, 0.0, 0.79)), 600.0)}
+_OPACITY = 0.3  # of modules in the solid view, for what is behind them
+_CUT = (0.32, 0.67, 0.47)  # places of the torso's slices, as shares of its grid: its heart is in front of all three
 EXAMPLES = (
     ("DERENZO", "Derenzo Phantom", "What 80 modules see of a Derenzo phantom"),
     ("XRAY", "X-ray Inside SPECT", "CT by 24 X-ray tubes above the modules, SPECT with it, dose"),
@@ -73,16 +77,18 @@ def example_job(context: bpy.types.Context, of_xrays: bool = False, replace: boo
             collection = scanner.build_scanner(scene, system, "X-ray", replace=replace)
             yield None
         adding.finish(stored_volumes)
+        item = bpy.context.object
         yield None
         rendering.show_planes(scene, run, collection)
-        projected = phantoms.with_children(bpy.context.object)[-1]
+        projected = phantoms.with_children(item)[-1]
         runs.add_run(scene, run, path, rendering.adopt_settings(scene, run, projected), collection)
         if of_xrays:
             _set_spect(scene)
         _hide_startup(scene, collection)
         studio.light(scene)
         images.show_below(mosaic, bpy.context)
-        scanner.set_up_scene(scene, collection, _VIEW.to_quaternion())
+        yield None  # the 3D view gets its new height
+        _show(scene, collection, item, projected)
         sources = "X-ray tubes" if of_xrays else "modules"
         return f"Loaded the example: {len(system)} {sources} and what they see of a {name} phantom"
 
@@ -96,6 +102,28 @@ def _set_spect(scene: bpy.types.Scene) -> None:
     settings = {"method": "TV", "fitted": "TV", "weight": 0.5, "voxels": 56, "spacing": 8.0, "center": _TORSO_CENTER}
     for name, value in settings.items():
         setattr(scene.mphdrr_reconstruction, name, value)
+
+
+def _show(
+    scene: bpy.types.Scene, collection: bpy.types.Collection, item: bpy.types.Object, projected: bpy.types.Object
+) -> None:
+    """Show an example's phantom between dimmed modules, one of which is active; nothing is selected, no lamp in the way."""
+    of_xrays = item != projected
+    number, rotation, reach = _SHOWN[of_xrays]
+    for part in ("COLLIMATOR", "CRYSTAL"):
+        collimators.part_material(part).diffuse_color[3] = _OPACITY
+    for lamp in objects.ensure_collection(scene, ids.STUDIO).objects:
+        lamp.hide_set(True)
+    item.select_set(False)
+    item.mphdrr_volume.look = "SHELL"
+    if of_xrays:
+        projected.mphdrr_volume.look = "CUT"
+        projected.mphdrr_volume.slices = [round(share * _VOXELS) for share in _CUT]
+        scene.mphdrr_display.planes, scene.mphdrr_display.plane_at_detector = "ACTIVE", True
+        scene.mphdrr_geometry.show_frustums = True
+    with following.writing():
+        selection.activate_in_list(scene, scanner.module(collection, number))
+    scanner.set_up_scene(scene, collection, rotation.to_quaternion(), reach)
 
 
 def _hide_startup(scene: bpy.types.Scene, collection: bpy.types.Collection) -> None:

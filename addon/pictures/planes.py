@@ -19,6 +19,7 @@ from . import images
 _KEY = "mphdrr_field"
 """Custom property of a plane: centre and size (5,) of the virtual detector in the camera's frame, mm."""
 _ROUNDING = 1e-5  # relative rounding of a background's scale
+_AT_DETECTOR = 0.999  # relative distance of a plane at the detector: a panel's own face would hide it
 _DEFAULT_SHARE = 0.3  # a plane's default distance from the pinhole, as a share of the distance to the ROI's surface
 
 
@@ -87,6 +88,7 @@ def update(scene: bpy.types.Scene) -> None:
             continue
         _place(plane, settings, fractions)
         plane.color[3] = settings.plane_opacity
+        plane.empty_image_side = "DOUBLE_SIDED" if settings.plane_at_detector else "BACK"  # the detector is behind the ROI
         for background in _backgrounds(plane):
             background.show_background_image = settings.backgrounds
             background.alpha = settings.plane_opacity
@@ -122,7 +124,7 @@ def _backgrounds(plane: bpy.types.Object) -> list[bpy.types.CameraBackgroundImag
 def relative_distance(settings: bpy.types.PropertyGroup, module: bpy.types.PropertyGroup, distance: float) -> float:
     """Return the distance of a module's plane from its pinhole, relative to the detector's `distance`, mm."""
     if settings.plane_at_detector:
-        return 1.0
+        return _AT_DETECTOR
     return (settings.plane_distance or _DEFAULT_SHARE * (module.pinhole_distance - module.roi_radius)) / distance
 
 

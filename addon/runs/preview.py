@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from ...core import InputError, PinholeSystem, ProjectionRun, Recipe, Views, Volume
 from ...core.geometry.scanner import Scanner
 from ...core.memory import readable_size
-from ...core.runs.display import Display
+from ...core.runs.display import Display, number_text
 from ...core.runs.mosaic import as_seen, fit_images, image_totals
 from ...core.runs.run_recipe import recipe_model, recipe_views, run_recipe
 from ..blender import jobs, reports, timers, windows
@@ -132,7 +132,12 @@ def make_preview(request: Request, quick: bool, voxels: dict[Path, Volume]) -> P
     colors = display.colored([bar], window)
     rows, columns = run.views.shape
     title, *notes = request.lines
-    lines = (title, f"{columns} × {rows} pixels, {word} {total:.4g}", f"{low:.4g} to {high:.4g} {run.unit}", *notes)
+    lines = (
+        title,
+        f"{columns} × {rows} pixels, {word} {number_text(total)}",
+        f"{number_text(low)} to {number_text(high)} {run.unit}",
+        *notes,
+    )
     corners = None if request.share is None else _corners(run.views, shown_part.shape[1:], request.share)
     return Preview(run, picture, colors, window, corners, lines, quick)
 

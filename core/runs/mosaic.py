@@ -16,7 +16,7 @@ from ..errors import InputError
 from ..files import AnyPath, write_bytes
 from ..validation import real_numbers
 from . import letters
-from .display import Display, unit_text
+from .display import Display, number_text, unit_text
 
 if TYPE_CHECKING:  # pages of figures read this file, and runs take a while
     from .run import ProjectionRun
@@ -33,6 +33,8 @@ def as_seen(images: ArrayLike) -> Array:
 
 COLUMNS = 20
 """Default number of images in a row."""
+_PAGE, _EMPTY_COST = 1.5, 9.0
+"""Width of a sheet of one ring over its height, in images, and the weight of the share of empty places against it."""
 _BORDER = 64
 """Grey between the images of a sheet, 0 to 255."""
 _SMALLEST = 64
@@ -97,7 +99,7 @@ def draw_sheet(
     display: Display | None = None,
     pixels: float = 6e6,
 ) -> MosaicSheet:
-    """Draw the images of modules in one picture, each ring in a row, with the modules' numbers and a colour bar.
+    """Draw the images of modules in one picture, each ring in a row or several, with the modules' numbers and a colour bar.
 
     Parameters
     ----------
@@ -105,8 +107,8 @@ def draw_sheet(
         Images (M, n_v, n_u). If they have more than `pixels` pixels together, means over blocks are drawn; small images
         are enlarged, so that the numbers do not hide them.
     numbers, rings
-        Number, or text, and ring of each module (M,). Rings are drawn in the order of their modules; a ring of more than
-        `COLUMNS` modules takes several rows.
+        Number, or text, and ring of each module (M,). Rings are drawn in the order of their modules, in rows of
+        `sheet_columns`.
     unit
         Unit of the images, for the colour bar. Where there is room, each image has its total (`image_totals`) in a corner.
     display
@@ -119,14 +121,14 @@ def draw_sheet(
     visible = display.part(projections)
     word, values = image_totals(visible, unit)
     images = display.colored(fit_images(as_seen(visible), pixels), window)
-    tiles = tile_places(np.asarray(rings))
+    tiles = tile_places(np.asarray(rings), sheet_columns(np.asarray(rings)))
     n_v, n_u = tile = images.shape[1:3]
     size = max(_SMALL_TEXT, min(n_v, n_u) / 5.5)
     gap = round(size / 6)
     corners = gap + tiles * (np.array(tile) + gap)
     height, width = corners.max(axis=0) + tile + gap
     picture = np.full((height, width, 3), _BORDER, np.uint8)
-    texts = [f"{word} {value:.4g}" for value in values]
+    texts = [f"{word} {number_text(value)}" for value in values]
     small = min(n_u / max(letters.width(total_text, 1.05) for total_text in texts), n_v / 5, 0.7 * size)
     for image, (row, column), number, total_text in zip(images, corners, np.asarray(numbers), texts, strict=True):
         picture[row : row + n_v, column : column + n_u] = image
@@ -202,6 +204,25 @@ def _means(images: Floats32, side: int) -> Floats32:
     return blocks.mean(axis=(2, 4), dtype=np.float32)
 
 
+def sheet_columns(rings: Integers) -> int:
+    """Return the number of images in a row of a sheet, of modules in `rings` (M,).
+
+    Of several rings each takes a row, or as many equal ones as rows of at most `COLUMNS` need. A single ring fills a page,
+    about 3 wide to 2 high, with few empty places: 24 images stand as 4 rows of 6.
+    """
+    counts = np.unique(rings, return_counts=True)[1]
+    n_images = int(counts.max())
+    if len(counts) > 1:
+        return -(-n_images // -(-n_images // COLUMNS))
+
+    def cost(columns: int) -> float:
+        """Return the distance from the page's shape, and the share of empty places."""
+        rows = -(-n_images // columns)
+        return abs(math.log(columns / rows / _PAGE)) + _EMPTY_COST * (1.0 - n_images / (rows * columns))
+
+    return min(range(1, n_images + 1), key=cost)
+
+
 def tile_places(rings: Integers, columns: int = COLUMNS) -> Integers:
     """Return row and column (M, 2) of each image, in images: a ring takes a row, or several of at most `columns` images."""
     tiles = np.empty((len(rings), 2), np.int64)
@@ -220,7 +241,7 @@ def _color_bar(display: Display, window: tuple[float, float], unit: str, height:
     line, em = math.ceil(1.1 * size), round(size)
     top, bottom = 2 * line, height - line
     values = display.marks(window, min(5, max(1, (bottom - top) // line)))  # as many steps as there is room for
-    marks = [(float(display.shares(value, window)), f"{value:.4g}") for value in values]
+    marks = [(float(display.shares(value, window)), number_text(value)) for value in values]
     columns = max(letters.width(unit, size), 1.5 * em + max(letters.width(text, size) for _, text in marks))
     bar = np.full((height, math.ceil(columns) + em, 3), _BORDER, np.uint8)
     _write(bar, unit, line // 3, em // 2, size, shade=1.0)

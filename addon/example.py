@@ -21,7 +21,7 @@ from .scanner import collimators, following, scanner, selection
 _VOXELS, _PIXELS = 140, 128  # voxels at most half of the reconstruction's
 # Module that is active, direction of the view, and radius shown, mm: the opening of the rings, with the phantom a third of
 # the view's height; and a tube whose panel is behind the torso, so that both are seen.
-_SHOWN = {False: (32, Euler((1.05, 0.0, 1.3)), 104.0), True: (18, Euler((1.2, 0.0, 0.79)), 600.0)}
+_SHOWN = {False: (15, Euler((1.12, 0.0, 1.15)), 104.0), True: (18, Euler((1.2, 0.0, 0.79)), 600.0)}
 _OPACITY = 0.3  # of modules in the solid view, for what is behind them
 _CUT = (0.32, 0.67, 0.47)  # places of the torso's slices, as shares of its grid: its heart is in front of all three
 EXAMPLES = (

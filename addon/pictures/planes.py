@@ -17,9 +17,9 @@ from ..scanner import grabbing, scanner, selection
 from . import images
 
 _KEY = "mphdrr_field"
-"""Custom property of a plane: centre and size (5,) of the virtual detector in the camera's frame, mm."""
+"""Custom property of a plane: centre and size (5,) of the virtual detector, or just before a panel, in camera space, mm."""
 _ROUNDING = 1e-5  # relative rounding of a background's scale
-_AT_DETECTOR = 0.999  # relative distance of a plane at the detector: a panel's own face would hide it
+_BEFORE_PANEL = 0.99  # relative distance of a plane at a panel, whose own face would hide it
 _DEFAULT_SHARE = 0.3  # a plane's default distance from the pinhole, as a share of the distance to the ROI's surface
 
 
@@ -50,7 +50,7 @@ def show(scene: bpy.types.Scene, run: ProjectionRun, collection: bpy.types.Colle
             planes_collection.objects.link(plane)
         else:
             _remove_background(camera.data, plane.data)
-        plane.data, plane[_KEY] = picture, field.tolist()
+        plane.data, plane[_KEY] = picture, (field * (1.0 if "activity" in run.system.takes else _BEFORE_PANEL)).tolist()
         _set_background(camera.data, field, picture)
         shown_planes.append(plane)
     _remove(list(old.values()))
@@ -88,7 +88,9 @@ def update(scene: bpy.types.Scene) -> None:
             continue
         _place(plane, settings, fractions)
         plane.color[3] = settings.plane_opacity
-        plane.empty_image_side = "DOUBLE_SIDED" if settings.plane_at_detector else "BACK"  # the detector is behind the ROI
+        plane.empty_image_side = (
+            "DOUBLE_SIDED" if settings.plane_at_detector else "BACK"
+        )  # the detector is behind the ROI
         for background in _backgrounds(plane):
             background.show_background_image = settings.backgrounds
             background.alpha = settings.plane_opacity
@@ -124,7 +126,7 @@ def _backgrounds(plane: bpy.types.Object) -> list[bpy.types.CameraBackgroundImag
 def relative_distance(settings: bpy.types.PropertyGroup, module: bpy.types.PropertyGroup, distance: float) -> float:
     """Return the distance of a module's plane from its pinhole, relative to the detector's `distance`, mm."""
     if settings.plane_at_detector:
-        return _AT_DETECTOR
+        return 1.0
     return (settings.plane_distance or _DEFAULT_SHARE * (module.pinhole_distance - module.roi_radius)) / distance
 
 

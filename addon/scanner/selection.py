@@ -83,7 +83,7 @@ def _show_panels(scene: bpy.types.Scene) -> None:
     """Show of all X-ray panels only the active source's: together they would hide everything."""
     active = active_module(bpy.context)
     for collection in scanner.scanners(scene):
-        for item in () if scanner.sees_activity(collection) else collection.all_objects:
+        for item in () if scanner.sees_activity(collection) else list(collection.all_objects):  # hiding changes these
             if item.mphdrr_module.part == "PANEL" and item.parent is not None:
                 objects.change(item, hide_viewport=item.parent.hide_viewport or item.parent != active)
 

@@ -27,7 +27,7 @@ COLORS = tuple(name for name in _COLORS if name not in (DIVERGING, DARK_DIVERGIN
 _STEPS = (1.0, 2.0, 2.5, 5.0, 10.0)
 """Steps between round numbers."""
 SUPERSCRIPTS = str.maketrans("0123456789-", "⁰¹²³⁴⁵⁶⁷⁸⁹⁻")
-_PLAIN_DIGITS = 6
+_PLAIN_DIGITS = 5
 """Digits before the decimal point up to which a number is written without a power of ten."""
 SCALES = ("linear", "sqrt", "log")
 _DECADES = 3.0
@@ -137,7 +137,7 @@ def ticks(low: float, high: float, max_steps: int) -> list[float]:
 
 
 def number_text(value: float, digits: int = 4) -> str:
-    """Return a number as people write it, with `digits` digits: "0.25", "−3", "16380", "3.349 × 10¹¹"."""
+    """Return a number as people write it, with `digits` digits: "0.25", "−3", "16380", "10⁵", "3.349 × 10¹¹"."""
     text = f"{value + 0.0:.{digits}g}"  # -0 is 0
     mantissa, _, exponent = text.partition("e")
     if exponent and 0 < int(exponent) < _PLAIN_DIGITS:

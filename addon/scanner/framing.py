@@ -74,8 +74,8 @@ def after_undo(*_: Any) -> None:
                 continue
             current, restored = _views_by_scanner[name][key][:: -1 if name in _scanners_before_undo else 1]
             if _state(space) == current:
-                for (owner, name), value in zip(_settings(space), restored, strict=True):
-                    setattr(owner, name, value)
+                for (owner, setting), value in zip(_settings(space), restored, strict=True):
+                    setattr(owner, setting, value)
 
 
 def forget(*_: Any) -> None:

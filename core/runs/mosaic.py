@@ -33,8 +33,8 @@ def as_seen(images: ArrayLike) -> Array:
 
 COLUMNS = 20
 """Default number of images in a row."""
-_PAGE, _EMPTY_COST = 1.5, 9.0
-"""Width of a sheet of one ring over its height, in images, and the weight of the share of empty places against it."""
+_PAGE, _NARROWEST, _WIDEST = 1.5, 1.0, 2.5
+"""Columns of a sheet of one ring over its rows."""
 _BORDER = 64
 """Grey between the images of a sheet, 0 to 255."""
 _SMALLEST = 64
@@ -207,20 +207,19 @@ def _means(images: Floats32, side: int) -> Floats32:
 def sheet_columns(rings: Integers) -> int:
     """Return the number of images in a row of a sheet, of modules in `rings` (M,).
 
-    Of several rings each takes a row, or as many equal ones as rows of at most `COLUMNS` need. A single ring fills a page,
-    about 3 wide to 2 high, with few empty places: 24 images stand as 4 rows of 6.
+    Of several rings each takes a row, or as many equal ones as rows of at most `COLUMNS` need. A single ring fills a page of
+    `_PAGE`, without empty places if a shape between `_NARROWEST` and `_WIDEST` allows it: 24 images stand as 4 rows of 6.
     """
     counts = np.unique(rings, return_counts=True)[1]
     n_images = int(counts.max())
     if len(counts) > 1:
         return -(-n_images // -(-n_images // COLUMNS))
-
-    def cost(columns: int) -> float:
-        """Return the distance from the page's shape, and the share of empty places."""
-        rows = -(-n_images // columns)
-        return abs(math.log(columns / rows / _PAGE)) + _EMPTY_COST * (1.0 - n_images / (rows * columns))
-
-    return min(range(1, n_images + 1), key=cost)
+    full = [columns for columns in range(1, n_images + 1) if n_images % columns == 0]
+    full = [columns for columns in full if _NARROWEST <= columns**2 / n_images <= _WIDEST]
+    page_columns = math.sqrt(_PAGE * n_images)
+    if full:
+        return min(full, key=lambda columns: abs(columns - page_columns))
+    return -(-n_images // max(1, round(n_images / page_columns)))
 
 
 def tile_places(rings: Integers, columns: int = COLUMNS) -> Integers:

@@ -16,7 +16,7 @@ _CLIP_START, _CLIP_END = 1.0, 20.0  # nearest distance drawn, mm, and farthest o
 _DARK: dict[str, dict[str, Any]] = {
     "shading": {"background_type": "VIEWPORT", "background_color": (0.006, 0.007, 0.009)},
     "overlay": dict.fromkeys(
-        ("show_floor", "show_axis_x", "show_axis_y", "show_cursor", "show_relationship_lines"), False
+        ("show_floor", "show_axis_x", "show_axis_y", "show_cursor", "show_relationship_lines", "show_text"), False
     ),
 }
 """Settings of a 3D view that show an example on a dark ground, without lines about it."""

@@ -14,7 +14,7 @@ from .display import SUPERSCRIPTS, resize_picture
 _CHARACTERS = "".join(map(chr, range(32, 127))) + "µ²³·×°±−–αβθφψΣ∫"
 _EM, _ROWS, _BASELINE = 48, 51, 39
 """Pixels per em of the stored letters, their height, and the row of their baseline."""
-_RAISED = 0.6
+_RAISED = 0.68
 """Size of a superscript relative to the letters."""
 # DejaVu Sans, whose licence allows any use: a byte for the width of each character, then one bit per pixel, column by
 # column, which is 1 where ink begins or ends along a row.
@@ -59,7 +59,7 @@ def _letters() -> dict[str, Floats32]:
     flips = bits[: widths.sum() * _ROWS].reshape(-1, _ROWS)
     ink = np.bitwise_xor.accumulate(flips, axis=0).T.astype(np.float32)
     letters = dict(zip(_CHARACTERS, np.split(ink, np.cumsum(widths)[:-1], axis=1), strict=True))
-    for plain, raised in SUPERSCRIPTS.items():  # "²" is stored with the letters, "⁴" is not
+    for plain, raised in SUPERSCRIPTS.items():
         small = resize_picture(letters[chr(plain)][..., None], *(round(_RAISED * n) for n in letters[chr(plain)].shape))
-        letters.setdefault(chr(raised), np.pad(small[..., 0], ((0, _ROWS - len(small)), (0, 0))))
+        letters[chr(raised)] = np.pad(small[..., 0], ((0, _ROWS - len(small)), (0, 0)))
     return letters

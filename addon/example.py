@@ -33,7 +33,14 @@ _RING: dict[str, Any] = {
     "source_radius": 600, "panel_radius": 480, "panel_size": (864, 648), "shape": (96, 128), "kvp": 120, "mas": 0.5,
 }  # fmt: skip
 """X-ray ring with panels so wide that each source sees the whole torso, with all of its grid before the panels."""
-_TORSO_CENTER = (35.0, -30.0, -30.0)  # mm, with the heart at the isocentre
+_XRAY_SETTINGS: dict[str, dict[str, Any]] = {
+    "mphdrr_projections": {"hole": "POINT", "pixel_points": 4, "width": 48, "height": 48},
+    "mphdrr_reconstruction": {"method": "TV", "fitted": "TV", "weight": 0.5, "voxels": 56, "spacing": 8.0,
+                              "center": (35.0, -30.0, -30.0)},  # mm: that of the torso, whose heart is at the isocentre
+    "mphdrr_display": {"planes": "ACTIVE", "plane_at_detector": True},
+    "mphdrr_geometry": {"show_frustums": True},
+}  # fmt: skip
+"""Settings for SPECT of the torso in seconds, by ideal holes, for the CT before it, and for a radiograph on its panel."""
 _STARTUP = ("Cube", "Light", "Camera")
 
 
@@ -82,8 +89,9 @@ def example_job(context: bpy.types.Context, of_xrays: bool = False, replace: boo
         rendering.show_planes(scene, run, collection)
         projected = phantoms.with_children(item)[-1]
         runs.add_run(scene, run, path, rendering.adopt_settings(scene, run, projected), collection)
-        if of_xrays:
-            _set_spect(scene)
+        for group, values in _XRAY_SETTINGS.items() if of_xrays else ():
+            for setting, value in values.items():
+                setattr(getattr(scene, group), setting, value)
         _hide_startup(scene, collection)
         studio.light(scene)
         images.show_below(mosaic, bpy.context)
@@ -95,15 +103,6 @@ def example_job(context: bpy.types.Context, of_xrays: bool = False, replace: boo
     return jobs.Job("Loading the example", work, finish, lambda: path.unlink(missing_ok=True))
 
 
-def _set_spect(scene: bpy.types.Scene) -> None:
-    """Set the panels for SPECT of the torso in seconds, by ideal holes, and for the CT before it."""
-    for name, value in {"hole": "POINT", "pixel_points": 4, "width": 48, "height": 48}.items():
-        setattr(scene.mphdrr_projections, name, value)
-    settings = {"method": "TV", "fitted": "TV", "weight": 0.5, "voxels": 56, "spacing": 8.0, "center": _TORSO_CENTER}
-    for name, value in settings.items():
-        setattr(scene.mphdrr_reconstruction, name, value)
-
-
 def _show(
     scene: bpy.types.Scene, collection: bpy.types.Collection, item: bpy.types.Object, projected: bpy.types.Object
 ) -> None:
@@ -112,15 +111,13 @@ def _show(
     number, rotation, reach = _SHOWN[of_xrays]
     for part in ("COLLIMATOR", "CRYSTAL"):
         collimators.part_material(part).diffuse_color[3] = _OPACITY
-    for lamp in objects.ensure_collection(scene, ids.STUDIO).objects:
-        lamp.hide_set(True)
+    for lamp in [lamp for studio_ in objects.collections_named(scene, ids.STUDIO) for lamp in studio_.objects]:
+        lamp.hide_viewport = True  # they light renders, and Home frames the scanner
     item.select_set(False)
     item.mphdrr_volume.look = "SHELL"
     if of_xrays:
         projected.mphdrr_volume.look = "CUT"
         projected.mphdrr_volume.slices = [round(share * _VOXELS) for share in _CUT]
-        scene.mphdrr_display.planes, scene.mphdrr_display.plane_at_detector = "ACTIVE", True
-        scene.mphdrr_geometry.show_frustums = True
     with following.writing():
         selection.activate_in_list(scene, scanner.module(collection, number))
     scanner.set_up_scene(scene, collection, rotation.to_quaternion(), reach)

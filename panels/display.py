@@ -43,7 +43,8 @@ def _draw_totals(layout: bpy.types.UILayout, context: bpy.types.Context) -> None
     column.label(text=text.format(name=camera.name, unit=summary["unit"]), translate=False)
     numbers = column.split(factor=0.4)
     numbers.active = False
-    draw_facts(numbers, *images.total_texts(summary, index))
+    total, maximum = (images.number_text(summary[name][index], 6) for name in ("totals", "maxima"))
+    draw_facts(numbers, (summary["summed"].capitalize(), total), ("Maximum", maximum))
 
 
 class MPHDRR_PT_display(_DisplayPanel, Popover, bpy.types.Panel):

@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 
 from ...core import ProjectionRun, Views, memory
 from ...core.progress import Progress, part_of, tell
-from ...core.runs.display import Display, number_text
+from ...core.runs.display import Display
+from ...core.runs.display import number_text as number_text  # for panels
 from ...core.runs.exr import exr_bytes
 from ...core.runs.mosaic import MosaicSheet, as_seen, block_means, draw_sheet, module_labels, png_bytes
 from ..blender import ids, jobs, reports, windows
@@ -149,12 +150,6 @@ def tiles(image: bpy.types.Image | None) -> dict[str, Any] | None:
     six.
     """
     return None if image is None or _TILES not in image else image[_TILES].to_dict()
-
-
-def total_texts(summary: dict[str, Any], index: int) -> tuple[tuple[str, str], tuple[str, str]]:
-    """Return the name and the number, as texts, of the total and of the maximum of an image of `tiles`."""
-    total, maximum = (number_text(summary[name][index], 6) for name in ("totals", "maxima"))
-    return (summary["summed"].capitalize(), total), ("Maximum", maximum)
 
 
 def mosaic_views(mosaic: bpy.types.Image) -> tuple[Views, NDArray[np.float64]] | None:

@@ -88,9 +88,8 @@ def update(scene: bpy.types.Scene) -> None:
             continue
         _place(plane, settings, fractions)
         plane.color[3] = settings.plane_opacity
-        plane.empty_image_side = (
-            "DOUBLE_SIDED" if settings.plane_at_detector else "BACK"
-        )  # the detector is behind the ROI
+        # At a detector, which is behind the ROI, it also faces whoever looks from the source.
+        plane.empty_image_side = "DOUBLE_SIDED" if settings.plane_at_detector else "BACK"
         for background in _backgrounds(plane):
             background.show_background_image = settings.backgrounds
             background.alpha = settings.plane_opacity

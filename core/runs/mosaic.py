@@ -214,12 +214,10 @@ def sheet_columns(rings: Integers) -> int:
     n_images = int(counts.max())
     if len(counts) > 1:
         return -(-n_images // -(-n_images // COLUMNS))
-    full = [columns for columns in range(1, n_images + 1) if n_images % columns == 0]
-    full = [columns for columns in full if _NARROWEST <= columns**2 / n_images <= _WIDEST]
     page_columns = math.sqrt(_PAGE * n_images)
-    if full:
-        return min(full, key=lambda columns: abs(columns - page_columns))
-    return -(-n_images // max(1, round(n_images / page_columns)))
+    full = [n for n in range(1, n_images + 1) if n_images % n == 0 and _NARROWEST <= n**2 / n_images <= _WIDEST]
+    nearly_full = -(-n_images // max(1, round(n_images / page_columns)))
+    return min(full, key=lambda n: abs(n - page_columns), default=nearly_full)
 
 
 def tile_places(rings: Integers, columns: int = COLUMNS) -> Integers:

@@ -92,7 +92,6 @@ def example_job(context: bpy.types.Context, of_xrays: bool = False, replace: boo
         for group, values in _XRAY_SETTINGS.items() if of_xrays else ():
             for setting, value in values.items():
                 setattr(getattr(scene, group), setting, value)
-        _hide_startup(scene, collection)
         studio.light(scene)
         images.show_below(mosaic, bpy.context)
         yield None  # the 3D view gets its new height
@@ -113,6 +112,10 @@ def _show(
         collimators.part_material(part).diffuse_color[3] = _OPACITY
     for lamp in [lamp for studio_ in objects.collections_named(scene, ids.STUDIO) for lamp in studio_.objects]:
         lamp.hide_viewport = True  # they light renders, and Home frames the scanner
+    for startup in filter(None, map(scene.objects.get, _STARTUP)):  # Blender's own startup file's
+        startup.hide_viewport = startup.hide_render = True
+        if scene.camera == startup:
+            scene.camera = scanner.modules(collection)[0]
     item.select_set(False)
     item.mphdrr_volume.look = "SHELL"
     if of_xrays:
@@ -121,12 +124,3 @@ def _show(
     with following.writing():
         selection.activate_in_list(scene, scanner.module(collection, number))
     scanner.set_up_scene(scene, collection, rotation.to_quaternion(), reach)
-
-
-def _hide_startup(scene: bpy.types.Scene, collection: bpy.types.Collection) -> None:
-    """Hide the objects of Blender's own startup file, and look through a module instead of its camera."""
-    for name in _STARTUP:
-        if (item := scene.objects.get(name)) is not None:
-            item.hide_viewport = item.hide_render = True
-            if scene.camera == item:
-                scene.camera = scanner.modules(collection)[0]

@@ -112,7 +112,6 @@ def _settings(space: bpy.types.SpaceView3D) -> list[tuple[Any, str]]:
 
 def _covered_widths(area: bpy.types.Area) -> tuple[int, int]:
     """Return the widths, pixels, that toolbar and sidebar cover at the left and the right of an area."""
-    widths = {region.alignment: region.width for region in area.regions if region.type in ("UI", "TOOLS")}
-    left_width, right_width = widths.get("LEFT", 0), widths.get("RIGHT", 0)
-    # Hidden regions are 1 pixel wide.
-    return (left_width if left_width > 1 else 0), (right_width if right_width > 1 else 0)
+    regions = [region for region in area.regions if region.type in ("UI", "TOOLS") and region.width > 1]  # 1: hidden
+    widths = {region.alignment: region.width for region in regions}
+    return widths.get("LEFT", 0), widths.get("RIGHT", 0)

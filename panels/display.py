@@ -43,7 +43,7 @@ def _draw_totals(layout: bpy.types.UILayout, context: bpy.types.Context) -> None
     column.label(text=text.format(name=camera.name, unit=tiles.unit()).removesuffix(" ()"), translate=False)
     numbers = column.split(factor=0.4)
     numbers.active = False
-    total, maximum = (f"{summary[name][index]:.6g}" for name in ("totals", "maxima"))
+    total, maximum = (images.number_text(summary[name][index], 6) for name in ("totals", "maxima"))
     draw_facts(numbers, (summary["summed"].capitalize(), total), ("Maximum", maximum))
 
 

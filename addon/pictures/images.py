@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from ...core import ProjectionRun, Views, memory
 from ...core.progress import Progress, part_of, tell
 from ...core.runs.display import Display
+from ...core.runs.display import number_text as number_text  # for panels
 from ...core.runs.exr import exr_bytes
 from ...core.runs.mosaic import MosaicSheet, as_seen, block_means, draw_sheet, module_labels, png_bytes
 from ..blender import ids, jobs, reports, windows

@@ -17,8 +17,9 @@ from ..scanner import grabbing, scanner, selection
 from . import images
 
 _KEY = "mphdrr_field"
-"""Custom property of a plane: centre and size (5,) of the virtual detector in the camera's frame, mm."""
+"""Custom property of a plane: centre and size (5,) of the virtual detector, or just before a panel, in camera space, mm."""
 _ROUNDING = 1e-5  # relative rounding of a background's scale
+_BEFORE_PANEL = 0.99  # relative distance of a plane at a panel, whose own face would hide it
 _DEFAULT_SHARE = 0.3  # a plane's default distance from the pinhole, as a share of the distance to the ROI's surface
 
 
@@ -49,7 +50,7 @@ def show(scene: bpy.types.Scene, run: ProjectionRun, collection: bpy.types.Colle
             planes_collection.objects.link(plane)
         else:
             _remove_background(camera.data, plane.data)
-        plane.data, plane[_KEY] = picture, field.tolist()
+        plane.data, plane[_KEY] = picture, (field * (1.0 if "activity" in run.system.takes else _BEFORE_PANEL)).tolist()
         _set_background(camera.data, field, picture)
         shown_planes.append(plane)
     _remove(list(old.values()))
@@ -87,6 +88,8 @@ def update(scene: bpy.types.Scene) -> None:
             continue
         _place(plane, settings, fractions)
         plane.color[3] = settings.plane_opacity
+        # At a detector, which is behind the ROI, it also faces whoever looks from the source.
+        plane.empty_image_side = "DOUBLE_SIDED" if settings.plane_at_detector else "BACK"
         for background in _backgrounds(plane):
             background.show_background_image = settings.backgrounds
             background.alpha = settings.plane_opacity

@@ -41,6 +41,6 @@ def backproject_job(context: bpy.types.Context, recipe: Recipe, how: str) -> job
         volumes.make_active(bpy.context, item)
         slices.add_slices(item)  # as smoke it would be a cloud: few of its voxels are 0
         seconds = time.perf_counter() - start
-        return f"Back-projected {item.name!r}: {stored.low:.4g} to {stored.high:.4g}, in {seconds:.1f} s"
+        return f"Back-projected {item.name!r}: {volumes.range_text(stored.low, stored.high, '1')}, in {seconds:.1f} s"
 
     return jobs.Job("Back-projecting", work, finish)

@@ -151,12 +151,17 @@ def quick_ranges(numbers: ArrayLike, rings: Integers) -> list[str]:
     return [numbers_text(np.asarray(numbers).tolist(), (rings >= s) & (rings < s + width)) for s in starts]
 
 
-def set_up_scene(scene: bpy.types.Scene, collection: bpy.types.Collection, rotation: Quaternion | None = None) -> None:
-    """Set the scene's units for a scanner, and turn the views to the whole scanner, seen from `rotation` if given."""
+def set_up_scene(
+    scene: bpy.types.Scene, collection: bpy.types.Collection, rotation: Quaternion | None = None, reach: float = 0.0
+) -> None:
+    """Set the scene's units for a scanner, and turn the views to it as `framing.frame_scanner` does.
+
+    `rotation` is the direction from which it is seen, `reach` the radius shown, mm, by default all of it.
+    """
     units = scene.unit_settings
     units.system, units.scale_length, units.length_unit = "METRIC", _MILLIMETER, "MILLIMETERS"
     reaches = [o.mphdrr_module.pinhole_distance + cameras.field_of(o.data)[2] for o in modules(collection)]
-    framing.frame_scanner(collection, max(reaches, default=_MIN_REACH), rotation)
+    framing.frame_scanner(collection, max(reaches, default=_MIN_REACH), rotation, reach)
 
 
 def is_set_up(scene: bpy.types.Scene) -> bool:

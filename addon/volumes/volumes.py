@@ -18,6 +18,7 @@ from ...core import InputError, Volume, memory
 from ...core.errors import warn
 from ...core.geometry.frames import checked_affine
 from ...core.progress import Progress, stages_of
+from ...core.runs.display import number_text
 from ..blender import compat, ids, jobs, objects, reports, storage
 from . import vdb, volume_materials
 from .stored_volumes import StoredVolume, move_grid, store_volume, write_states
@@ -95,7 +96,12 @@ def add_volume_job(
 def values_text(stored: StoredVolume) -> str:
     """Return the range of a volume's values as the window shows it, with the unit: "0 to 100 kBq/mL"."""
     unit, factor = volume_materials.display_unit(stored.volume.quantity)
-    return f"{factor * stored.low:.4g} to {factor * stored.high:.4g} {unit}".removesuffix(" 1")
+    return range_text(factor * stored.low, factor * stored.high, unit)
+
+
+def range_text(low: float, high: float, unit: str) -> str:
+    """Return a range of values with its unit as a text, which has no unit of 1."""
+    return f"{number_text(low)} to {number_text(high)} {unit}".removesuffix(" 1")
 
 
 def replace_stored(item: bpy.types.Object, stored: StoredVolume) -> None:

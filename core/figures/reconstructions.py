@@ -9,11 +9,12 @@ import numpy as np
 from ..arrays import ArrayLike, Floats32
 from ..runs import letters
 from ..runs.display import DARK_DIVERGING, Display, ticks
+from ..runs.display import number_text as number
 from ..volumes.resampling import resample
 from ..volumes.sights import bright_value, full_slices
 from ..volumes.volume import Volume
 from .page import Page, circle
-from .parts import PLANES, Axes, arrange, bar_width, color_bar, number
+from .parts import PLANES, Axes, arrange, bar_width, color_bar
 
 SIZE, SIZE_BESIDE_TRUTH = (1600, 500), (1600, 850)
 """Default width and height, pixels, of the picture of a reconstruction alone, and beside the truth."""

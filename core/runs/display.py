@@ -27,6 +27,9 @@ COLORS = tuple(name for name in _COLORS if name not in (DIVERGING, DARK_DIVERGIN
 """Names of the colour maps; all but grey are perceptually uniform."""
 _STEPS = (1.0, 2.0, 2.5, 5.0, 10.0)
 """Steps between round numbers."""
+SUPERSCRIPTS = str.maketrans("0123456789-", "⁰¹²³⁴⁵⁶⁷⁸⁹⁻")
+_PLAIN_DIGITS = 5
+"""Digits before the decimal point up to which a number is written without a power of ten."""
 SCALES = ("linear", "sqrt", "log")
 PARTS = ("object", "half", "whole")
 """Parts of images that can be shown, see `Display.shown`."""
@@ -152,6 +155,18 @@ def ticks(low: float, high: float, max_steps: int) -> list[float]:
     step = power * next(s for s in _STEPS if s * power >= smallest_step * (1 - 1e-9))
     first = np.ceil(low / step - 1e-9)
     return [float(step * n) + 0.0 for n in np.arange(first, np.floor(high / step + 1e-9) + 1)]  # -0 is 0
+
+
+def number_text(value: float, digits: int = 4) -> str:
+    """Return a number as people write it, with `digits` digits: "0.25", "−3", "16380", "10⁵", "3.349 × 10¹¹"."""
+    text = f"{value + 0.0:.{digits}g}"  # -0 is 0
+    mantissa, _, exponent = text.partition("e")
+    if exponent and 0 < int(exponent) < _PLAIN_DIGITS:
+        text = f"{float(text):.0f}"
+    elif exponent:
+        power = "10" + str(int(exponent)).translate(SUPERSCRIPTS)
+        text = mantissa[:-1] + power if mantissa in ("1", "-1") else f"{mantissa} × {power}"
+    return text.replace("-", "−")
 
 
 def unit_text(unit: str) -> str:

@@ -16,7 +16,7 @@ from ..errors import InputError
 from ..files import AnyPath, write_bytes
 from ..validation import real_numbers
 from . import letters
-from .display import Display, unit_text
+from .display import Display, number_text, unit_text
 
 if TYPE_CHECKING:  # pages of figures read this file, and runs take a while
     from .run import ProjectionRun
@@ -33,6 +33,8 @@ def as_seen(images: ArrayLike) -> Array:
 
 COLUMNS = 20
 """Default number of images in a row."""
+_PAGE, _NARROWEST, _WIDEST = 1.5, 1.0, 2.5
+"""Columns of a sheet of one ring over its rows."""
 _BORDER = 64
 """Grey between the images of a sheet, 0 to 255."""
 _SMALLEST = 96
@@ -97,7 +99,7 @@ def draw_sheet(
     display: Display | None = None,
     pixels: float = 6e6,
 ) -> MosaicSheet:
-    """Draw the images of modules in one picture, each ring in a row, with the modules' numbers and a colour bar.
+    """Draw the images of modules in one picture, each ring in a row or several, with the modules' numbers and a colour bar.
 
     Parameters
     ----------
@@ -105,8 +107,8 @@ def draw_sheet(
         Images (M, n_v, n_u). If they have more than `pixels` pixels together, means over blocks are drawn; small images
         are enlarged, so that the numbers do not hide them.
     numbers, rings
-        Number, or text, and ring of each module (M,). Rings are drawn in the order of their modules; a ring of more than
-        `COLUMNS` modules takes several rows.
+        Number, or text, and ring of each module (M,). Rings are drawn in the order of their modules, in rows of
+        `sheet_columns`.
     unit
         Unit of the images, for the colour bar. Where there is room, each image has its total (`image_totals`) in a corner:
         that of the middle half if the display shows this, else that of the whole image.
@@ -121,7 +123,7 @@ def draw_sheet(
     counted = display.part(projections)  # an automatic part changes no number
     word, values = image_totals(counted, unit)
     images = display.colored(fit_images(as_seen(visible), pixels), window)
-    tiles = tile_places(np.asarray(rings))
+    tiles = tile_places(np.asarray(rings), sheet_columns(np.asarray(rings)))
     n_v, n_u = tile = images.shape[1:3]
     size = max(_SMALL_TEXT, min(n_v, n_u) / 5)
     gap = round(size / 6)
@@ -129,7 +131,7 @@ def draw_sheet(
     height, width = corners.max(axis=0) + tile + gap
     picture = np.full((max(height, math.ceil(5 * size)), width, 3), _BORDER, np.uint8)  # room for the colour bar
     is_tall = tiles[:, 0].max() > 0  # the word stands once, below the colour bar, where there is room
-    texts = [f"{'' if is_tall else word} {value:.4g}".strip() for value in values]
+    texts = [f"{'' if is_tall else word} {number_text(value)}".strip() for value in values]
     small = min(n_u / max(letters.width(total_text, 1.05) for total_text in texts), n_v / 5, size)
     for image, (row, column), number, total_text in zip(images, corners, np.asarray(numbers), texts, strict=True):
         picture[row : row + n_v, column : column + n_u] = image
@@ -206,6 +208,22 @@ def _means(images: Floats32, side: int) -> Floats32:
     return blocks.mean(axis=(2, 4), dtype=np.float32)
 
 
+def sheet_columns(rings: Integers) -> int:
+    """Return the number of images in a row of a sheet, of modules in `rings` (M,).
+
+    Of several rings each takes a row, or as many equal ones as rows of at most `COLUMNS` need. A single ring fills a page of
+    `_PAGE`, without empty places if a shape between `_NARROWEST` and `_WIDEST` allows it: 24 images stand as 4 rows of 6.
+    """
+    counts = np.unique(rings, return_counts=True)[1]
+    n_images = int(counts.max())
+    if len(counts) > 1:
+        return -(-n_images // -(-n_images // COLUMNS))
+    page_columns = math.sqrt(_PAGE * n_images)
+    full = [n for n in range(1, n_images + 1) if n_images % n == 0 and _NARROWEST <= n**2 / n_images <= _WIDEST]
+    nearly_full = -(-n_images // max(1, round(n_images / page_columns)))
+    return min(full, key=lambda n: abs(n - page_columns), default=nearly_full)
+
+
 def tile_places(rings: Integers, columns: int = COLUMNS) -> Integers:
     """Return row and column (M, 2) of each image, in images: a ring takes a row, or several of at most `columns` images."""
     tiles = np.empty((len(rings), 2), np.int64)
@@ -224,7 +242,7 @@ def _color_bar(display: Display, window: tuple[float, float], unit: str, note: s
     line, em = math.ceil(1.1 * size), round(size)
     top, bottom = 2 * line, height - (3 * line // 2 if note else 0) - line
     values = display.marks(window, min(5, max(1, (bottom - top) // line)))  # as many steps as there is room for
-    marks = [(float(display.shares(value, window)), f"{value:.4g}") for value in values]
+    marks = [(float(display.shares(value, window)), number_text(value)) for value in values]
     widths = [1.5 * em + letters.width(text, size) for _, text in marks]
     columns = max(letters.width(unit, size), letters.width(note, size), *widths)
     bar = np.full((height, math.ceil(columns) + em, 3), _BORDER, np.uint8)

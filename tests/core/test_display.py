@@ -7,9 +7,9 @@ from hypothesis import strategies as st
 from PIL import Image
 
 import mphdrr.core as mph
-from mphdrr.core.runs.display import COLORS, SCALES, Display
+from mphdrr.core.runs.display import COLORS, SCALES, Display, number_text
 from mphdrr.core.runs.letters import text_ink, width, wrap_text
-from mphdrr.core.runs.mosaic import draw_sheet, image_totals, write_png
+from mphdrr.core.runs.mosaic import draw_sheet, image_totals, sheet_columns, tile_places, write_png
 
 from .conftest import refused
 
@@ -94,6 +94,32 @@ def test_every_image_stands_in_its_rings_row_as_the_pinhole_sees_it(shape, facto
             np.testing.assert_array_equal(own[26:-24], wanted[26:-24])
 
 
+@pytest.mark.parametrize("rings", [[24], [1], [10], [23], [80], [100], [360], [20, 20, 20, 20], [30, 30], [41, 7]])
+def test_a_sheet_has_the_shape_of_a_page_or_a_row_for_each_ring(rings):
+    columns = sheet_columns(np.repeat(np.arange(len(rings)), rings))
+    tiles = tile_places(np.repeat(np.arange(len(rings)), rings), columns)
+    assert len(set(map(tuple, tiles))) == sum(rings) and columns == tiles[:, 1].max() + 1, "no column is empty"
+    rows = int(tiles[:, 0].max()) + 1
+    if len(rings) > 1:
+        assert columns <= 20 and rows == sum(-(-n // 20) for n in rings)
+    elif any(sum(rings) % k == 0 and k * k <= sum(rings) <= 2.5 * k * k for k in range(1, 21)):
+        assert rows * columns == sum(rings) and rows <= columns <= 2.5 * rows, "no tile is empty"
+    else:
+        assert rows * columns - sum(rings) < columns and 0.9 * rows <= columns <= 2.5 * rows
+    assert rings != [24] or (rows, columns) == (4, 6)
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [(-0.0, "0"), (0.25, "0.25"), (-3.0, "−3"), (16384, "16380"), (1e5, "10⁵"), (-1e7, "−10⁷"), (3.349e11, "3.349 × 10¹¹"),
+     (2.5e-7, "2.5 × 10⁻⁷"), (np.inf, "inf")],
+)  # fmt: skip
+def test_numbers_are_written_as_people_write_them(value, text):
+    assert number_text(value) == text
+    unknown = text_ink("?", 48)[0]
+    assert not any(np.array_equal(text_ink(letter, 48)[0], unknown) for letter in text)
+
+
 def has_ink(picture, text, size):
     """Return whether a text stands somewhere in a picture, in white on something dark."""
     ink, _ = text_ink(text, size)
@@ -112,7 +138,7 @@ def test_every_image_has_its_sum_or_mean_and_the_bar_round_numbers(unit):
     # In several rows the tiles have numbers alone, larger, and the word stands below the colour bar.
     for rings, prefix, legend in (([0, 0, 0], f"{word} ", ""), ([0, 0, 1], "", f"tile: {word}")):
         drawn = draw_sheet(images, [1, 2, 3], rings, unit)
-        texts = [f"{prefix}{value:.4g}" for value in values]
+        texts = [f"{prefix}{number_text(value)}" for value in values]
         small = min(size, 128 / max(width(text, 1.05) for text in texts))
         for (row, column), text in zip(drawn.corners, texts, strict=True):
             assert has_ink(drawn.picture[row : row + 128, column : column + 128], text, small)

@@ -53,7 +53,7 @@ def show(scene: bpy.types.Scene, run: ProjectionRun, collection: bpy.types.Colle
         _set_background(camera.data, field, picture)
         shown_planes.append(plane)
     _remove(list(old.values()))
-    update(scene)
+    edited(scene)
     return shown_planes
 
 
@@ -66,6 +66,19 @@ def remove(scene: bpy.types.Scene, modules: list[bpy.types.Object] | None = None
     """Remove the planes and the backgrounds of modules, given as cameras, or of all."""
     _remove([plane for plane in planes(scene) if modules is None or plane.parent in modules])
     objects.remove_empty_collections(scene, ids.PLANES)
+
+
+def set_hidden(scene: bpy.types.Scene, is_hidden: bool) -> None:
+    """Hide or show the planes by the eye beside their collection's name."""
+    for layer in scene.view_layers:
+        for collection in objects.collections_named(scene, ids.PLANES):
+            layer.layer_collection.children[collection.name].hide_viewport = is_hidden
+
+
+def edited(scene: bpy.types.Scene) -> None:
+    """Show the planes as the scene's settings say, after an edit of these."""
+    set_hidden(scene, False)
+    update(scene)
 
 
 def _remove(unwanted: list[bpy.types.Object]) -> None:

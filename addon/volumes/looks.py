@@ -13,14 +13,14 @@ from ...core.physics.ct_numbers import mu_of_hu
 from ..blender import compat, objects
 from . import vdb, volume_materials, volumes
 
-_KEY = "mphdrr_surface"  # custom property of a surface's object
+_KEY = "mphdrr_surface"  # custom property of a surface's object: its number among those of its volume, from 1
 # Exponent and gain of the extinction; looks without an entry draw a surface instead of smoke.
 _SMOKE = {"DENSITY": (1.0, 1.0), "BRIGHTEST": (3.0, 0.4)}
-_SURFACE_SHARE = {"SHELL": 0.6, "CUT": 0.1}  # the surface's value as a fraction of the display range
+_SURFACE_SHARE = {"SHELL": 0.4, "CUT": 0.1}  # the surface's value as a fraction of the display range
 _TISSUES = {  # low and high end of the display range and the surface's value, HU; the surface's linear RGB
-    "BONE": ((150.0, 1300.0, 250.0), (0.80, 0.68, 0.46)),
+    "BONE": ((-160.0, 240.0, 250.0), (0.85, 0.76, 0.58)),
     "SOFT": ((-160.0, 240.0, -160.0), (0.72, 0.33, 0.20)),
-    "LUNG": ((-1000.0, 150.0, -500.0), (0.62, 0.20, 0.17)),
+    "LUNG": ((-1000.0, 150.0, -190.0), (0.62, 0.20, 0.17)),
 }
 _ENERGY = 140.5  # keV; assumed for a volume of mu whose file names no energy
 _MAX_SURFACE_VOXELS = 160  # along each side of the grid from which Blender makes a surface
@@ -58,23 +58,28 @@ def apply_look(item: bpy.types.Object, cut: volume_materials.Cut | None) -> None
     if gain:
         remove_surface(item)
         return
-    surface = surface_of(item) or _new_surface(item)
-    objects.change(surface, location=_surface_offset(item))
-    mesher, cutter = surface.modifiers
     mode = "GRID" if max(settings.shape) <= _MAX_SURFACE_VOXELS else "VOXEL_AMOUNT"
-    objects.change(mesher, grid_name=settings.quantity, threshold=settings.surface / factor, resolution_mode=mode)
-    volume_materials.set_cut(cutter.node_group, cut)
-    objects.change(cutter, show_viewport=cut is not None, show_render=cut is not None)
+    surfaces = surfaces_of(item) or _new_surfaces(item)
+    for surface, value in zip(surfaces, (settings.surface / factor, low), strict=False):
+        is_cut = cut is not None and surface == surfaces[-1]  # bones stand whole in the skin
+        objects.change(surface, location=_surface_offset(item))
+        mesher, cutter = surface.modifiers
+        grid, zero = settings.quantity, 0.0
+        if value < 0 and vdb.SMOKE in item.data.grids:  # Blender draws no surface of a negative value
+            grid, zero = vdb.SMOKE, volume_materials.default_range(grid, 0.0, 1.0)[0]
+        objects.change(mesher, grid_name=grid, threshold=value - zero, resolution_mode=mode)
+        volume_materials.set_cut(cutter.node_group, cut)
+        objects.change(cutter, show_viewport=is_cut, show_render=is_cut)
 
 
-def surface_of(item: bpy.types.Object) -> bpy.types.Object | None:
-    """Return the object of a volume's surface; None where no surface is drawn."""
-    return next((child for child in item.children if _KEY in child), None)
+def surfaces_of(item: bpy.types.Object) -> list[bpy.types.Object]:
+    """Return the objects of a volume's surfaces: none of smoke; of bones also the skin, at the display range's low end."""
+    return sorted((child for child in item.children if _KEY in child), key=lambda surface: surface[_KEY])
 
 
 def remove_surface(item: bpy.types.Object) -> None:
-    """Remove a volume's surface, if it has one, with its mesh, materials and nodes."""
-    if (surface := surface_of(item)) is not None:
+    """Remove a volume's surfaces, if it has some, with their meshes, materials and nodes."""
+    for surface in surfaces_of(item):
         unused = [surface.modifiers[1].node_group, *surface.data.materials]
         objects.remove_objects([surface])
         objects.remove_unused(unused)
@@ -82,21 +87,29 @@ def remove_surface(item: bpy.types.Object) -> None:
 
 def _surface_offset(item: bpy.types.Object) -> Vector:
     """Return the offset, mm, from where Blender places a surface, that of the drawn voxels, to the voxels' centres."""
-    item.data.grids.load()
     if (grid := item.data.grids.get(item.mphdrr_volume.quantity)) is None:  # its file is missing
         return Vector()
     return grid.matrix_object.to_3x3() @ Vector([-compat.VDB_CENTER_SHIFT] * 3)
 
 
-def _new_surface(item: bpy.types.Object) -> bpy.types.Object:
+def _new_surfaces(item: bpy.types.Object) -> list[bpy.types.Object]:
+    """Return the new surfaces of a volume in its look."""
+    settings = item.mphdrr_volume
+    tissues = [settings.look, *(["SOFT"] if settings.look == "BONE" else [])]
+    if settings.look not in _TISSUES or settings.quantity not in volume_materials.XRAY:
+        return [_new_surface(item, 1)]
+    return [_new_surface(item, number, _TISSUES[tissue][1]) for number, tissue in enumerate(tissues, 1)]
+
+
+def _new_surface(
+    item: bpy.types.Object, number: int, rgb: tuple[float, float, float] | None = None
+) -> bpy.types.Object:
     """Return a new surface of a volume: an object with a mesh of the volume and with nodes that cut it."""
     name = f"{item.name} surface"
     mesh = bpy.data.meshes.new(name)
-    settings = item.mphdrr_volume
-    tissue = _TISSUES.get(settings.look) if settings.quantity in volume_materials.XRAY else None
-    mesh.materials.append(new_material(name, volume_materials.item_ramp(item, smoke=True), tissue and tissue[1]))
+    mesh.materials.append(new_material(name, volume_materials.item_ramp(item, smoke=True), rgb))
     surface = bpy.data.objects.new(name, mesh)
-    surface[_KEY] = True
+    surface[_KEY] = number
     surface.parent, surface.hide_select = item, True
     modifier = surface.modifiers.new("Surface", "VOLUME_TO_MESH")
     modifier.object, modifier.use_smooth_shade, modifier.voxel_amount = item, True, _MAX_SURFACE_VOXELS

@@ -68,11 +68,14 @@ def remove(scene: bpy.types.Scene, modules: list[bpy.types.Object] | None = None
     objects.remove_empty_collections(scene, ids.PLANES)
 
 
-def set_hidden(scene: bpy.types.Scene, is_hidden: bool) -> None:
-    """Hide or show the planes by the eye beside their collection's name."""
-    for layer in scene.view_layers:
-        for collection in objects.collections_named(scene, ids.PLANES):
-            layer.layer_collection.children[collection.name].hide_viewport = is_hidden
+def set_hidden(scene: bpy.types.Scene, is_hidden: bool) -> bool:
+    """Hide or show the planes by the eye beside their collection's name; return whether that changes something."""
+    names = [collection.name for collection in objects.collections_named(scene, ids.PLANES)]
+    eyes = [layer.layer_collection.children[name] for layer in scene.view_layers for name in names]
+    changed = [eye for eye in eyes if eye.hide_viewport != is_hidden]
+    for eye in changed:
+        eye.hide_viewport = is_hidden
+    return bool(changed)
 
 
 def edited(scene: bpy.types.Scene) -> None:

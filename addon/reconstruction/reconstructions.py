@@ -37,7 +37,7 @@ from ...core.volumes.sights import full_slices
 from ..blender import ids, jobs, objects, storage, windows
 from ..pictures import images, planes
 from ..runs import rendering, runs
-from ..volumes import slices, stored_volumes, volumes
+from ..volumes import looks, slices, stored_volumes, volumes
 
 _MIN_INTERVAL = 2.0  # s between two pictures of a running reconstruction
 _PNG_LEVEL = 1  # fast compression
@@ -160,6 +160,7 @@ def _make_job(
         state, reconstruction = result
         item = live.show(state)
         volumes.make_active(bpy.context, item)
+        item.select_set(False)  # its box would stand around the rods
         slices.add_slices(item, full_slices(reconstruction.volume.array).tolist())
         images.show_below(bpy.data.images[ids.RECONSTRUCTION], bpy.context)
         storage.remove_results(live.files)
@@ -204,7 +205,7 @@ class _LiveResult:
             self._is_shown = True
             old = scene.mphdrr_reconstruction.volume if item is None else None
             self._hidden = objects.hide(runs.projected_volume(scene), old)
-            planes.set_hidden(scene, True)
+            self._has_hidden_planes = planes.set_hidden(scene, True)
         if item is None:  # first state, or the user has deleted the object
             item = volumes.add_stored(state.stored, self.name, scene.collection)
             self._item = item.session_uid
@@ -228,10 +229,13 @@ class _LiveResult:
             volumes.replace_stored(item, self._previous.stored)
         elif item is not None:
             materials = list(item.data.materials)
+            looks.remove_surface(item)
             objects.remove_objects([item, *item.children])
             objects.remove_unused(materials)
         scene = jobs.find_by_uid(bpy.data.scenes, self._scene)
         if scene is not None and self._is_shown:
+            if self._has_hidden_planes:
+                planes.set_hidden(scene, False)
             settings = scene.mphdrr_reconstruction
             with suppress(ReferenceError):
                 settings.volume, settings.record = self._old_record

@@ -23,6 +23,7 @@ _TISSUES = {  # low and high end of the display range and the surface's value, H
     "LUNG": ((-1000.0, 150.0, -190.0), (0.62, 0.20, 0.17)),
 }
 _ENERGY = 140.5  # keV; assumed for a volume of mu whose file names no energy
+_SURFACE_COLOR = 0.85  # place of a surface's colour in the ramp: activity is gold, which no selected object is
 _MAX_SURFACE_VOXELS = 160  # along each side of the grid from which Blender makes a surface
 
 
@@ -87,6 +88,8 @@ def remove_surface(item: bpy.types.Object) -> None:
 
 def _surface_offset(item: bpy.types.Object) -> Vector:
     """Return the offset, mm, from where Blender places a surface, that of the drawn voxels, to the voxels' centres."""
+    if not item.data.grids.load():  # of a sequence whose frame is not known yet: the error would stay
+        item.data.grids.unload()
     if (grid := item.data.grids.get(item.mphdrr_volume.quantity)) is None:  # its file is missing
         return Vector()
     return grid.matrix_object.to_3x3() @ Vector([-compat.VDB_CENTER_SHIFT] * 3)
@@ -135,9 +138,9 @@ def _cut_node_tree(name: str) -> bpy.types.NodeTree:
 def new_material(
     name: str, colors: volume_materials.Ramp, rgb: tuple[float, float, float] | None = None
 ) -> bpy.types.Material:
-    """Return a dull material in the linear colour `rgb`, by default that of a ramp at three quarters of its range."""
+    """Return a dull material in the linear colour `rgb`, by default one of the brighter colours of a ramp."""
     material, shader = compat.surface_material(name, "ShaderNodeBsdfPrincipled")
-    color = (*(rgb or volume_materials.color_at(colors, 0.75)), 1.0)
+    color = (*(rgb or volume_materials.color_at(colors, _SURFACE_COLOR)), 1.0)
     material.diffuse_color = color
     shader.inputs["Base Color"].default_value, shader.inputs["Roughness"].default_value = color, 0.6
     return material

@@ -25,10 +25,9 @@ _LATTICE = "mphdrr_slice_of"  # custom property: shape and affine of the grid th
 _MATERIAL = "mphdrr_material"  # custom property: a plane's own material, with its picture
 _GROUP = "mphDRR Slice"  # the node group that draws all slices
 _SHADES = 256
-_CLEAR = (
-    0.1  # share of the display range below which activity is transparent on slices; it is opaque from twice that on
-)
-_FRAME = 0.008, (0.45, 0.5, 0.56)  # width of a slice's frame, relative to its longer side, and its linear RGB
+# Share of the display range below which activity is transparent on slices; from twice that on it is opaque.
+_CLEAR = 0.2
+_FRAME = 0.008, (0.6, 0.66, 0.74)  # width of a slice's frame, relative to its longer side, and its linear RGB
 _FRONT = (0.7, -0.5, 0.5)  # direction towards the viewer of a new scene: the volume is cut open on that side
 
 # The volume of which slices were drawn last, with its file: reading it takes longer than everything else.

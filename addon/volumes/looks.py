@@ -19,11 +19,11 @@ _SMOKE = {"DENSITY": (1.0, 1.0), "BRIGHTEST": (3.0, 0.4)}
 _SURFACE_SHARE = {"SHELL": 0.4, "CUT": 0.1}  # the surface's value as a fraction of the display range
 _TISSUES = {  # low and high end of the display range and the surface's value, HU; the surface's linear RGB
     "BONE": ((-160.0, 240.0, 250.0), (0.85, 0.76, 0.58)),
-    "SOFT": ((-160.0, 240.0, -160.0), (0.72, 0.33, 0.20)),
+    "SOFT": ((-160.0, 240.0, -160.0), (0.72, 0.42, 0.30)),
     "LUNG": ((-1000.0, 150.0, -190.0), (0.62, 0.20, 0.17)),
 }
 _ENERGY = 140.5  # keV; assumed for a volume of mu whose file names no energy
-_SURFACE_COLOR = 0.85  # place of a surface's colour in the ramp: activity is gold, which no selected object is
+_SURFACE_COLOR = 0.85  # place of a surface's colour among those of the ramp: activity is gold
 _MAX_SURFACE_VOXELS = 160  # along each side of the grid from which Blender makes a surface
 
 
@@ -60,7 +60,8 @@ def apply_look(item: bpy.types.Object, cut: volume_materials.Cut | None) -> None
         remove_surface(item)
         return
     mode = "GRID" if max(settings.shape) <= _MAX_SURFACE_VOXELS else "VOXEL_AMOUNT"
-    surfaces = surfaces_of(item) or _new_surfaces(item)
+    has_skin = settings.look == "BONE" and settings.quantity in volume_materials.XRAY
+    surfaces = surfaces_of(item) or [_new_surface(item, number) for number in ((1, 2) if has_skin else (1,))]
     for surface, value in zip(surfaces, (settings.surface / factor, low), strict=False):
         is_cut = cut is not None and surface == surfaces[-1]  # bones stand whole in the skin
         objects.change(surface, location=_surface_offset(item))
@@ -95,22 +96,14 @@ def _surface_offset(item: bpy.types.Object) -> Vector:
     return grid.matrix_object.to_3x3() @ Vector([-compat.VDB_CENTER_SHIFT] * 3)
 
 
-def _new_surfaces(item: bpy.types.Object) -> list[bpy.types.Object]:
-    """Return the new surfaces of a volume in its look."""
-    settings = item.mphdrr_volume
-    tissues = [settings.look, *(["SOFT"] if settings.look == "BONE" else [])]
-    if settings.look not in _TISSUES or settings.quantity not in volume_materials.XRAY:
-        return [_new_surface(item, 1)]
-    return [_new_surface(item, number, _TISSUES[tissue][1]) for number, tissue in enumerate(tissues, 1)]
-
-
-def _new_surface(
-    item: bpy.types.Object, number: int, rgb: tuple[float, float, float] | None = None
-) -> bpy.types.Object:
+def _new_surface(item: bpy.types.Object, number: int) -> bpy.types.Object:
     """Return a new surface of a volume: an object with a mesh of the volume and with nodes that cut it."""
     name = f"{item.name} surface"
     mesh = bpy.data.meshes.new(name)
-    mesh.materials.append(new_material(name, volume_materials.item_ramp(item, smoke=True), rgb))
+    settings = item.mphdrr_volume
+    look = settings.look if number == 1 else "SOFT"
+    tissue = _TISSUES.get(look) if settings.quantity in volume_materials.XRAY else None
+    mesh.materials.append(new_material(name, volume_materials.item_ramp(item, smoke=True), tissue and tissue[1]))
     surface = bpy.data.objects.new(name, mesh)
     surface[_KEY] = number
     surface.parent, surface.hide_select = item, True
@@ -140,7 +133,7 @@ def new_material(
 ) -> bpy.types.Material:
     """Return a dull material in the linear colour `rgb`, by default one of the brighter colours of a ramp."""
     material, shader = compat.surface_material(name, "ShaderNodeBsdfPrincipled")
-    color = (*(rgb or volume_materials.color_at(colors, _SURFACE_COLOR)), 1.0)
+    color = (*(rgb or colors[int(_SURFACE_COLOR * (len(colors) - 1))][1]), 1.0)
     material.diffuse_color = color
     shader.inputs["Base Color"].default_value, shader.inputs["Roughness"].default_value = color, 0.6
     return material

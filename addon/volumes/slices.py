@@ -27,7 +27,7 @@ _GROUP = "mphDRR Slice"  # the node group that draws all slices
 _SHADES = 256
 # Share of the display range below which activity is transparent on slices; from twice that on it is opaque.
 _CLEAR = 0.2
-_FRAME = 0.008, (0.6, 0.66, 0.74)  # width of a slice's frame, relative to its longer side, and its linear RGB
+_FRAME = 0.008, (0.6, 0.66, 0.74)  # width of a slice's frame, relative to its sides, and its linear RGB
 _FRONT = (0.7, -0.5, 0.5)  # direction towards the viewer of a new scene: the volume is cut open on that side
 
 # The volume of which slices were drawn last, with its file: reading it takes longer than everything else.
@@ -243,19 +243,14 @@ def _plane(item: bpy.types.Object, volume: Volume, axis: int, name: str) -> bpy.
     """Return a new plane of a volume, perpendicular to a grid axis, at index 0."""
     name = f"{item.name} {name}"
     column, row = (a for a in range(3) if a != axis)
-    sides = np.array([volume.grid.shape[column], volume.grid.shape[row]])
     uv = np.array([(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0)])
+    uv = np.concatenate([uv, (1 + 2 * _FRAME[0]) * uv - _FRAME[0]])
     corners = np.zeros((8, 4))
     corners[:, 3] = 1.0
-    corners[:4, [column, row]] = uv * sides - 0.5
-    spacing = volume.grid.spacing[[column, row]]
-    corners[4:, [column, row]] = (
-        corners[:4, [column, row]] + (2 * uv - 1) * _FRAME[0] * np.max(sides * spacing) / spacing
-    )
-    mesh, border = bpy.data.meshes.new(name), [(k, (k + 1) % 4, 4 + (k + 1) % 4, 4 + k) for k in range(4)]
-    mesh.from_pydata((corners @ volume.grid.affine.T)[:, :3].tolist(), [], [(0, 1, 2, 3), *border])
-    loops = [vertex % 4 for polygon in mesh.polygons for vertex in polygon.vertices]
-    mesh.uv_layers.new(name="Slice").data.foreach_set("uv", uv[loops].astype(np.float32).ravel())
+    corners[:, [column, row]] = uv * [volume.grid.shape[column], volume.grid.shape[row]] - 0.5
+    mesh, faces = bpy.data.meshes.new(name), [(0, 1, 2, 3), (0, 1, 5, 4), (1, 2, 6, 5), (2, 3, 7, 6), (3, 0, 4, 7)]
+    mesh.from_pydata((corners @ volume.grid.affine.T)[:, :3].tolist(), [], faces)
+    mesh.uv_layers.new(name="Slice").data.foreach_set("uv", uv[np.ravel(faces)].astype(np.float32).ravel())
     mesh.polygons.foreach_set("material_index", [0, 1, 1, 1, 1])
     image = bpy.data.images.new(name, volume.grid.shape[column], volume.grid.shape[row], alpha=True)
     mesh.materials.append(_material(name, image))

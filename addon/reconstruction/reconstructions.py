@@ -204,8 +204,7 @@ class _LiveResult:
         if not self._is_shown:
             self._is_shown = True
             old = scene.mphdrr_reconstruction.volume if item is None else None
-            self._hidden = objects.hide(runs.projected_volume(scene), old)
-            self._has_hidden_planes = planes.set_hidden(scene, True)
+            self._hidden = objects.hide(runs.projected_volume(scene), old, *planes.planes(scene))
         if item is None:  # first state, or the user has deleted the object
             item = volumes.add_stored(state.stored, self.name, scene.collection)
             self._item = item.session_uid
@@ -214,7 +213,7 @@ class _LiveResult:
         else:
             volumes.replace_stored(item, state.stored)
         if state.window[0] < state.window[1]:
-            volumes.set_display_range(item, state.window)
+            volumes.set_display_range(item, *state.window)
         images.store_png(ids.RECONSTRUCTION, state.picture)
         settings = scene.mphdrr_reconstruction
         settings.volume, settings.record = item, json.dumps(state.record)
@@ -234,8 +233,6 @@ class _LiveResult:
             objects.remove_unused(materials)
         scene = jobs.find_by_uid(bpy.data.scenes, self._scene)
         if scene is not None and self._is_shown:
-            if self._has_hidden_planes:
-                planes.set_hidden(scene, False)
             settings = scene.mphdrr_reconstruction
             with suppress(ReferenceError):
                 settings.volume, settings.record = self._old_record

@@ -60,12 +60,10 @@ def add_slices(item: bpy.types.Object, indices: Sequence[int] | None = None) -> 
 def remove_slices(item: bpy.types.Object) -> None:
     """Remove a volume's planes, with their meshes, materials and images, and close the cut."""
     for plane in planes_of(item):
-        materials = list(plane.data.materials)
-        trees = [material.node_tree for material in materials if material and material.node_tree]
-        pictures = [tree.nodes["Slice"].image for tree in trees if "Slice" in tree.nodes]
+        materials, picture = list(plane.data.materials), _image(plane)
         objects.remove_objects([plane])
         objects.remove_unused(materials)
-        objects.remove_unused([*pictures, bpy.data.node_groups.get(_GROUP)])
+        objects.remove_unused([picture, bpy.data.node_groups.get(_GROUP)])
     looks.apply_look(item, None)
 
 

@@ -129,8 +129,7 @@ def _derived_volume_job(
     count = len(readers)
     n_x, n_y, n_z = item.mphdrr_volume.shape
     memory.require(8.0 * count * n_x * n_y * n_z, f"the {label} of {count * n_x * n_y * n_z} voxels")
-    frame_start, sequence_mode = item.data.frame_start, item.data.sequence_mode
-    look = item.mphdrr_volume.look
+    frame_start, sequence_mode, look = item.data.frame_start, item.data.sequence_mode, item.mphdrr_volume.look
 
     def make(progress: Progress) -> list[Volume]:
         """Return the volume that `derive` makes of each state."""

@@ -346,13 +346,12 @@ def _set_properties(item: bpy.types.Object, stored: StoredVolume) -> None:
     settings.center_shift = compat.VDB_CENTER_SHIFT
     if not is_typed:
         display_range = volume_materials.default_range(volume.quantity, factor * stored.low, factor * stored.high)
-    set_display_range(item, display_range)
+    set_display_range(item, *display_range)
 
 
-def set_display_range(item: bpy.types.Object, display_range: tuple[float, float]) -> None:
+def set_display_range(item: bpy.types.Object, low: float, high: float) -> None:
     """Set the display range of a volume; the surface's value stays at its share of the range."""
-    settings, (new_low, new_high) = item.mphdrr_volume, display_range
-    low, high = settings.display_low, settings.display_high
-    if display_range != (low, high):
-        settings.surface = new_low + (settings.surface - low) / ((high - low) or 1.0) * (new_high - new_low)
-    settings.display_low, settings.display_high = display_range
+    settings = item.mphdrr_volume
+    share = (settings.surface - settings.display_low) / ((settings.display_high - settings.display_low) or 1.0)
+    settings.surface = low + share * (high - low)
+    settings.display_low, settings.display_high = low, high

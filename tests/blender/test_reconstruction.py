@@ -12,6 +12,7 @@ import pytest
 import mphdrr.core as mph
 from mphdrr.addon.blender import ids, jobs, plots, storage, windows
 from mphdrr.addon.perspective import color_bar
+from mphdrr.addon.pictures import planes
 from mphdrr.addon.reconstruction import backprojections, reconstructions
 from mphdrr.addon.reconstruction.reconstruction_properties import (
     PROPERTIES,
@@ -88,8 +89,8 @@ def test_the_volume_is_that_of_the_command_line(render, scene):
     rods = mph.score_volume(expected.volume, *run_truth(run)).derenzo
     assert [tuple(row) for row in known["rods"]] == [sector.cells for sector in rods if sector.rod_diameter]
     assert bpy.data.objects["Derenzo"].hide_get(), "the truth stands where the reconstruction is"
-    planes, at = slices.planes_of(item), full_slices(expected.volume.array)
-    assert len(planes) == 3 and item.mphdrr_volume.slices[:] == tuple(at)
+    at = full_slices(expected.volume.array)
+    assert len(slices.planes_of(item)) == 3 and item.mphdrr_volume.slices[:] == tuple(at)
     truth, look = mph.resample(run.volume, expected.volume.grid, "mean"), item.mphdrr_volume
     assert look.display_high == pytest.approx(truth.array.max(), rel=1e-5), "as in the picture of its slices"
     assert look.look == "SHELL" and look.surface == pytest.approx(0.4 * look.display_high)
@@ -97,7 +98,8 @@ def test_the_volume_is_that_of_the_command_line(render, scene):
 
 
 def are_planes_hidden(scene) -> bool:
-    return scene.view_layers[0].layer_collection.children[ids.PLANES].hide_viewport
+    (is_hidden,) = {plane.hide_get() for plane in planes.planes(scene)}
+    return is_hidden
 
 
 def test_projections_make_way_for_the_result_until_they_are_wanted(render, scene):

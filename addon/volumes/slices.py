@@ -27,7 +27,7 @@ _GROUP = "mphDRR Slice"  # the node group that draws all slices
 _SHADES = 256
 # Share of the display range below which activity is transparent on slices; from twice that on it is opaque.
 _CLEAR = 0.2
-_FRAME = 0.008, (0.6, 0.66, 0.74)  # width of a slice's frame, relative to its sides, and its linear RGB
+_FRAME = 0.01, (0.75, 0.8, 0.88)  # width of a slice's frame, relative to its sides, and its linear RGB
 _FRONT = (0.7, -0.5, 0.5)  # direction towards the viewer of a new scene: the volume is cut open on that side
 
 # The volume of which slices were drawn last, with its file: reading it takes longer than everything else.

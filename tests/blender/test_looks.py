@@ -170,6 +170,20 @@ def test_bones_stand_in_the_skin_which_is_cut_open_at_the_slices(scene):
     assert is_cut_away(bone) and not is_cut_away(skin)
 
 
+def test_a_ct_makes_way_for_its_attenuation_and_undo_brings_it_back(scene):
+    volumes.add_volume(Volume(np.full((9, 9, 9), 40.0), Grid.centered(9, 2.0), "hu"), "CT")
+    bpy.context.view_layer.objects.active = bpy.data.objects["CT"]
+    bpy.ops.ed.undo_push(message="before")
+    assert bpy.ops.mphdrr.ct_to_attenuation() == {"FINISHED"}
+    bpy.ops.ed.undo_push(message="made")
+    mu = bpy.data.objects["CT mu"]
+    assert bpy.data.objects["CT"].hide_get() and not mu.hide_get() and mu.mphdrr_volume.look == "BONE"
+    water = attenuation("water", 140.5)
+    assert mu.mphdrr_volume.display_low < water < mu.mphdrr_volume.display_high < mu.mphdrr_volume.surface
+    bpy.ops.ed.undo()
+    assert "CT mu" not in bpy.data.objects and not bpy.data.objects["CT"].hide_get()
+
+
 def test_slices_of_nema_show_six_spheres_also_after_reopening(nema, tmp_path):
     slices.add_slices(nema)
     nema.mphdrr_volume.display_low = 6.0  # above the background

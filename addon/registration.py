@@ -169,7 +169,7 @@ UPDATES: dict[str, Callable[..., None]] = {
     "look": slices.look_changed,
     "sight_lines": sight_lines.redraw,
     "display": recoloring.display_changed,
-    "planes": planes.update,
+    "planes": planes.edited,
     "epipolar": epipolar_drawing.redraw,
     "active_run": rendering.active_run_changed,
     "modules_removed": _modules_removed,

@@ -163,10 +163,10 @@ class FigureScene:
             self.add_object(mesh)
 
     def _add_volume(self, item: bpy.types.Object) -> None:
-        """Add the volume's object, with a copy of its surface if it has one."""
+        """Add the volume's object, with a copy of its surfaces if it has some."""
         self.volume_objects = [self.add_object(item.data)]
         self.volume_objects[0].matrix_world = item.matrix_world
-        if (surface := looks.surface_of(item)) is not None:  # its look draws a surface instead of smoke
+        for surface in looks.surfaces_of(item):  # its look draws surfaces instead of smoke
             copy = surface.copy()
             copy.data, copy.parent = surface.data.copy(), None
             self.scene.collection.objects.link(copy)

@@ -49,12 +49,12 @@ def show(scene: bpy.types.Scene, run: ProjectionRun, collection: bpy.types.Colle
             plane.mphdrr_module.part, plane.mphdrr_module.number = "PLANE", number
             planes_collection.objects.link(plane)
         else:
-            _remove_background(camera.data, plane.data)
+            _remove_backgrounds(plane)
         plane.data, plane[_KEY] = picture, (field * (1.0 if "activity" in run.system.takes else _BEFORE_PANEL)).tolist()
         _set_background(camera.data, field, picture)
         shown_planes.append(plane)
     _remove(list(old.values()))
-    update(scene)
+    edited(scene)
     return shown_planes
 
 
@@ -69,11 +69,17 @@ def remove(scene: bpy.types.Scene, modules: list[bpy.types.Object] | None = None
     objects.remove_empty_collections(scene, ids.PLANES)
 
 
+def edited(scene: bpy.types.Scene) -> None:
+    """Show the planes as the scene's settings say after an edit of these; a reconstruction has hidden them."""
+    for plane in planes(scene):
+        plane.hide_set(False, view_layer=scene.view_layers[0])
+    update(scene)
+
+
 def _remove(unwanted: list[bpy.types.Object]) -> None:
     """Remove planes and their backgrounds."""
     for plane in unwanted:
-        if plane.parent is not None:
-            _remove_background(plane.parent.data, plane.data)
+        _remove_backgrounds(plane)
     bpy.data.batch_remove(unwanted)  # their pictures stay, which may be the user's
     objects.update_hidden_scenes()
 
@@ -167,8 +173,7 @@ def _set_background(camera: bpy.types.Camera, field: NDArray[np.float64], pictur
     camera.show_background_images = True
 
 
-def _remove_background(camera: bpy.types.Camera, picture: bpy.types.Image | None) -> None:
-    """Remove a picture from a camera's view."""
-    for background in list(camera.background_images):
-        if background.image == picture:
-            camera.background_images.remove(background)
+def _remove_backgrounds(plane: bpy.types.Object) -> None:
+    """Remove a plane's picture from its camera's view, if it has a camera."""
+    for background in _backgrounds(plane) if plane.parent is not None else ():
+        plane.parent.data.background_images.remove(background)

@@ -246,13 +246,13 @@ def test_a_frustum_and_a_back_projection_are_seen(window, work_folder):
     seen = window("frustum")
     assert len(seen["shown"]) == 13 and seen["active"] == "Derenzo"
     corners = np.array(seen["corners"])
-    assert purple(work_folder / "aside.png", corners.min(axis=0), corners.max(axis=0)) > 3000
+    assert violet(work_folder / "aside.png", corners.min(axis=0), corners.max(axis=0)) > 3000
     # From the pinhole, all layers lie on one another, in the frame of what the camera sees.
     layers, frame = np.array(seen["through"]).reshape(12, 4, 2), np.array(seen["frame"])
     assert np.abs(layers - layers[0]).max() <= 1
     assert np.abs(layers[0].min(axis=0) - frame.min(axis=0)).max() <= 2
     assert np.abs(layers[0].max(axis=0) - frame.max(axis=0)).max() <= 2
-    assert purple(work_folder / "pinhole.png", frame.min(axis=0), frame.max(axis=0)) > 10000
+    assert violet(work_folder / "pinhole.png", frame.min(axis=0), frame.max(axis=0)) > 10000
     assert seen["kept"] == "Derenzo through Module 27"
     assert seen["backprojected"].endswith("Geometric Mean")
     x, y = seen["middle"]
@@ -260,8 +260,8 @@ def test_a_frustum_and_a_back_projection_are_seen(window, work_folder):
     assert ((found[..., 1] > found[..., 0] + 30) & (found[..., 1] > 80)).sum() > 1000, "slices in greens"
 
 
-def purple(picture: Path, low: np.ndarray, high: np.ndarray) -> int:
-    """Return the number of pixels between two places that have the colours of activity."""
+def violet(picture: Path, low: np.ndarray, high: np.ndarray) -> int:
+    """Return the number of pixels between two places that are violet to red, as dim activity is."""
     red, green, blue = np.moveaxis(pixels(picture)[low[1] : high[1], low[0] : high[0]], 2, 0)
     return int(((blue > green + 30) & (red > green + 30)).sum())
 
@@ -371,7 +371,7 @@ def test_window_and_command_draw_the_same_figures(blender, blender_script, windo
         path = work_folder / f"{kind}-command.png"
         blender("--command", "mphdrr", "figure", kind, blend, "--size", SIZE, "--samples", "8", "-o", path)
         colors = pixels(path)  # where Cycles draws no volumes, as in Debian, the phantom is a surface
-        assert kind != "cut-away" or np.count_nonzero(colors[..., 0] - colors[..., 1] > 40) > 100, "its purple"
+        assert kind != "cut-away" or np.count_nonzero(colors[..., 0] - colors[..., 1] > 40) > 100, "its colours"
         own, other = (np.asarray(Image.open(p).convert("L")) for p in (work_folder / f"{kind}.png", path))
         assert own.std() > 15, "something is to be seen"
         assert ssim(own, other) > 0.99

@@ -19,11 +19,12 @@ _SPLINE, _WIDE = 0.5, 0.67
 def pixel_parts(model: Any, views: Views, grid: Grid) -> int:
     """Return the number of parts of a pixel's side to blur apart, as many as the module of `Emission` with most needs."""
     magnification = model.system.collimator_length / model.system.pinhole_distance
-    hole = 0.0 if model.hole == "point" else model.effective_diameter * (1 + magnification)
-    widths = np.hypot(grid.voxel_volume ** (1 / 3) * magnification, hole).tolist()
-    shadows = (hole * model.is_by_depth * np.ones(len(views))).tolist()
+    hole = (0.0 if model.hole == "point" else model.effective_diameter) * (1 + magnification)
+    voxel = float(grid.voxel_volume ** (1 / 3)) * magnification
     pixels = [(m, side) for m in range(len(views)) for side in model.crystal_pitch(views, m)]
-    return max(_parts(_sigma(model, m) / side, widths[m] / side, shadows[m] / side) for m, side in pixels)
+    return max(
+        _parts(*(x / side for x in (_sigma(model, m), hole[m], voxel[m])), model.is_by_depth) for m, side in pixels
+    )
 
 
 def matrices(model: Any, views: Views, m: int, parts: int) -> tuple[Floats, Floats]:
@@ -53,17 +54,21 @@ def _sigma(model: Any, m: int) -> float:
     return float(model._optics_of(m).intrinsic_fwhm) / FWHM_PER_SIGMA
 
 
-def _parts(sigma: float, width: float, shadow: float) -> int:
+def _parts(sigma: float, hole: float, voxel: float, is_by_depth: bool) -> int:
     """Return the number of parts of a pixel's side to blur apart, so that at most 0.3 % of the counts are misplaced.
 
-    Means over whole pixels no longer say where in a pixel an edge was. `sigma` is the blur's standard deviation and `width`
-    the width of an unblurred point's image, a disc, both in pixels. The law was fitted to images of such discs. More parts that
-    include the spline, in the hole's `shadow`, cost less than parts of several cells.
+    Means over whole pixels no longer say where in a pixel an edge was. `sigma` is the blur's standard deviation, `hole` and
+    `voxel` the widths of their shadows, all in pixels. The law was fitted to images of discs with such edges. More parts that
+    include the spline cost less than parts of several cells.
     """
-    if sigma**1.5 < 0.003 * width:
+    width = math.hypot(hole, voxel)
+    if sigma == 0:
         return 1
+    is_narrow = sigma**1.5 < 0.003 * width
     variance = width**2 / 16 + sigma**2 + 1 / 12
-    misplaced, widened = 3.3 / (sigma**0.4 * width**0.55) - 0.5, (15 / (width**0.5 * variance)) ** 0.4
-    least = min(max(math.ceil(max(misplaced, widened)), 2 if sigma < 0.7 else 1), 10)
-    more = range(least, 2 * least + 1 if sigma * least > _WIDE else 0)
-    return next((n for n in more if _includes_spline(sigma * n, shadow * n)), least)
+    sharp = min(200 * sigma**0.8 / width, 3.9 / (sigma**0.4 * width**0.55))
+    misplaced = sharp * (1 + voxel / (3 * sigma)) ** -0.55 - 0.5
+    widened = 1.0 if is_narrow else (15 / (width**0.5 * variance)) ** 0.4
+    least = min(max(math.ceil(max(misplaced, widened)), 2 if sigma < 0.7 and not is_narrow else 1), 10)
+    more = range(least, 2 * least + 1 if is_by_depth and sigma * least > _WIDE else 0)
+    return next((n for n in more if _includes_spline(sigma * n, hole * n)), least)

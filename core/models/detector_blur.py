@@ -23,7 +23,7 @@ def pixel_parts(model: Any, views: Views, grid: Grid) -> int:
     voxel = float(grid.voxel_volume ** (1 / 3)) * magnification
     pixels = [(m, side) for m in range(len(views)) for side in model.crystal_pitch(views, m)]
     return max(
-        _parts(*(x / side for x in (_sigma(model, m), hole[m], voxel[m])), model.is_by_depth) for m, side in pixels
+        _parts(_sigma(model, m) / side, hole[m] / side, voxel[m] / side, model.is_by_depth) for m, side in pixels
     )
 
 

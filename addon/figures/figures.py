@@ -185,7 +185,7 @@ def _render_film(
             yield from (None for _ in _render_picture(stage, style, page))
         pictures.append(folder / f"{path.stem}-{k + 1:04d}.png")
         page.write(pictures[-1])
-        yield "rendering pictures", k + 1, style.frames
+        yield "rendering", k + 1, style.frames
         if reel.is_set():
             break
     yield from engine.write_film(pictures, path, style.fps, page)

@@ -76,12 +76,6 @@ def ramp(quantity: str, smoke: bool = False) -> Ramp:
     return _INFERNO if quantity == "activity" else _GREENS
 
 
-def color_at(colors: Ramp, share: float) -> tuple[float, float, float]:
-    """Return the colour of a ramp, linear RGB, at a share of the display range, 0 to 1."""
-    positions, rgb = zip(*colors, strict=True)
-    return tuple(float(np.interp(share, positions, channel)) for channel in np.transpose(rgb))  # type: ignore[return-value]
-
-
 def display_unit(quantity: str) -> tuple[str, float]:
     """Return the unit in which the window shows a quantity, and the factor from the voxels' values to that unit."""
     return _DISPLAY_UNITS.get(quantity, (UNITS[quantity], 1.0))

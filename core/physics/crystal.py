@@ -58,28 +58,49 @@ def share_inside(middle: ArrayOrTensor, size: ArrayOrTensor, side: ArrayOrTensor
     return (last - first).clip(min=0) / size
 
 
-def gaussian_blur(n: int, sigma: float, parts: int = 1) -> Floats:
+def gaussian_blur(n: int, sigma: float, parts: int = 1, blurred: float = 0.0) -> Floats:
     """Return the matrix (n, n parts) that blurs pixel means with a Gaussian of `sigma` pixels.
 
     It takes the means of the `parts` of each of n pixels, and returns those of the pixels. The means hold the pixels' box
     already, so the Gaussian is sampled, not integrated; the variance that small ones lack is added by one step of diffusion.
+    The means may have a part of the blur already, of `blurred` pixels.
     """
-    width = sigma * parts
-    distance = np.arange(-n * parts, n * parts + 1)
+    width = math.sqrt(sigma**2 - blurred**2) * parts
     reach = math.ceil(8 * width) + 1  # beyond it float64 has nothing
     squares = np.arange(-reach, reach + 1) ** 2
-    scale = -0.5 / max(width, 1e-3) ** 2
-    total = np.exp(scale * squares).sum()
-    missing = max(width**2 - squares @ np.exp(scale * squares) / total, 0.0) / 2
-    sampled = np.where(abs(distance) <= reach, np.exp(scale * distance**2) / total, 0)
-    kernel = np.convolve(sampled, [missing, 1 - 2 * missing, missing], "same")
-    over_pixel = np.convolve(kernel, np.ones(parts))
-    return over_pixel[n * parts + np.arange(n)[:, None] * parts + parts - 1 - np.arange(n * parts)]
+    kernel = np.exp(-0.5 * squares / max(width, 1e-3) ** 2)
+    kernel /= kernel.sum()
+    missing = max(width**2 - squares @ kernel, 0.0) / 2
+    return _blur(n, sigma, parts, np.convolve(kernel, [missing, 1 - 2 * missing, missing]))
 
 
 def point_blur(n: int, sigma: float) -> Floats:
     """Return the matrix (n, n) from values at the centres of n pixels to their means, blurred by `sigma` pixels."""
-    with np.errstate(divide="ignore"):  # a sigma of 0, no blur, gives 1 on the diagonal
-        edges = (np.arange(n + 1) - 0.5) / (sigma * math.sqrt(2))
-    kernel = np.diff([0.5 * math.erf(x) for x in edges])
-    return kernel[np.abs(np.arange(n)[:, None] - np.arange(n))]
+    reach = math.ceil(8 * sigma) + 1
+    edges = (np.arange(2 * reach + 2) - reach - 0.5) / max(sigma * math.sqrt(2), 1e-9)
+    return _blur(n, sigma, 1, np.diff([0.5 * math.erf(x) for x in edges]))
+
+
+def _blur(n: int, sigma: float, parts: int, kernel: Floats) -> Floats:
+    """Return the matrix (n, n parts) of a blur of `sigma` pixels, which far from the ends is `kernel`, by parts of pixels.
+
+    No photons come from beyond an end. A flux that changes linearly up to there is blurred exactly.
+    """
+    half, width = len(kernel) // 2, sigma * parts
+    near = min(n, half // parts + 2)  # pixels that an end has an effect on
+    columns = np.arange(max(n * parts, near * parts + half + 1))
+    over_pixel = np.pad(np.convolve(kernel, np.ones(parts)), len(columns))
+    endless = over_pixel[len(columns) + half + parts - 1 + np.arange(n)[:, None] * parts - columns]
+    matrix = endless[:, : n * parts].copy()
+    edges = np.arange(near + 1) * parts
+    # What the blur changes in the photons between an end and each edge, for fluxes of 1 and of the distance from the end.
+    beyond = np.array([0.5 * math.erfc(x / max(width * math.sqrt(2), 1e-9)) for x in edges])
+    density = width * np.exp(-0.5 * (edges / max(width, 1e-9)) ** 2) / math.sqrt(2 * math.pi)
+    even = np.diff(density - edges * beyond) + parts - endless[:near].sum(axis=1)
+    linear = np.diff(width**2 * (1 - beyond) + edges * density + edges**2 * (1 - beyond)) / 2 - endless[:near] @ (
+        columns + 0.5
+    )
+    value, slope = ([1.5, -0.5], [-1, 1]) if n * parts > 1 else ([1], [0])  # at the end, from the two outermost means
+    for end in (matrix, matrix[::-1, ::-1]):
+        end[:near, : len(value)] += np.outer(even, value) + np.outer(linear, slope)
+    return matrix.clip(min=0)

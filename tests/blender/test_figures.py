@@ -47,7 +47,7 @@ def example(scene, dc_spect, tmp_path):
     run = mph.ProjectionRun(mph.Projector(volume.grid, views)(volume), system, views, volume)
     mph.write_run(run, tmp_path / "run.h5")
     rendering.show_run(scene, run, tmp_path / "run.h5", item)
-    scanner.show_modules(collection, 5, 41)
+    scanner.show_modules(collection, "5-41")
     update()
     return scene
 
@@ -317,7 +317,7 @@ def test_an_animation_that_is_ended_keeps_its_pictures(pictured, tmp_path, monke
     def started(**more):
         job = figures.figure_job(bpy.context, "turntable", [path], SIZE, seconds=1.0, fps=9, **more)
         steps = job.finish(job.work(lambda done, total: None))
-        while next(steps) != ("rendering pictures", 3, 9):
+        while next(steps) != ("rendering", 3, 9):
             pass
         return job, steps
 

@@ -266,11 +266,12 @@ def _is_drawn(item: bpy.types.Object) -> bool:
         stage.scene.cycles.use_denoising = False
         shown = [stage.add_object(item.data)]
         shown[0].matrix_world = item.matrix_world
-        if (surface := looks.surface_of(item)) is not None:  # its look draws a surface instead of smoke
-            shown.append(surface.copy())
-            shown[1].data, shown[1].parent = surface.data.copy(), None
-            stage.scene.collection.objects.link(shown[1])
-            shown[1].matrix_world = surface.matrix_world
+        for surface in looks.surfaces_of(item):  # its look draws surfaces instead of smoke
+            copy = surface.copy()
+            copy.data, copy.parent = surface.data.copy(), None
+            stage.scene.collection.objects.link(copy)
+            copy.matrix_world = surface.matrix_world
+            shown.append(copy)
         for is_hidden in (True, False):
             for part in shown:
                 part.hide_render = is_hidden

@@ -130,34 +130,6 @@ def test_pixels_of_a_rendered_picture_are_read_exactly(scene, tmp_path):
     assert "page.png" not in bpy.data.images
 
 
-def test_a_picture_that_a_volume_does_not_change_is_warned_of(example, tmp_path, monkeypatch):
-    """As where this Blender's Cycles draws no volumes: pictures with and without it are the same."""
-    (item,) = volumes.volume_objects(example)
-    changes, sizes, path = 0, [], tmp_path / "figure.png"
-
-    def render(scene):
-        yield
-        width, height = (n * scene.render.resolution_percentage // 100 for n in (640, 480))
-        sizes.append((width, scene.cycles.use_denoising))
-        shown = [o for o in scene.collection.all_objects if o.type == "VOLUME" and not o.hide_render]
-        picture = np.full((height, width, 3), 90, np.uint8)
-        picture[height // 2 :: 50, width // 2 :: 50] += np.uint8(len(shown) * changes)
-        picture[height // 3 : height // 2, width // 3 : width // 2] += np.uint8(len(shown) * changes)
-        return picture
-
-    monkeypatch.setattr(figures, "_render_pixels", render)
-    for kind in ("cut-away", "inside"):
-        sizes.clear()
-        (text,) = draw(kind, path, (640, 480), samples=1)
-        assert text.startswith(f"the picture shows {item.name!r} as the surface at 50 kBq/mL: ") and path.is_file()
-        assert sizes[-1] == (640, True) and {width for width, _ in sizes[:-1]} == {243}
-    changes = 60
-    assert draw("inside", path, (640, 480)) == []
-    sizes.clear()
-    assert draw("scanner", path, (640, 480)) == []
-    assert len(sizes) == 1, "a figure without a volume is rendered once"
-
-
 @pytest.mark.long
 @pytest.mark.parametrize("look", ["DENSITY", "SHELL"])
 def test_a_volume_is_seen_or_its_absence_is_said(example, tmp_path, look):

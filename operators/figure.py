@@ -1,25 +1,36 @@
 """File > Export > mphDRR Figure, Picture and Animation: draw or render the scene for papers and talks."""
 
-from typing import Any
+from typing import Any, cast
 
 import bpy
 from bpy.props import BoolProperty, EnumProperty, FloatProperty, IntProperty, StringProperty
 
-from ..addon.blender import file_properties, ids, jobs, reports
+from ..addon.blender import file_properties, ids, jobs, layouts, reports
 from ..addon.blender.choices import items
 from ..addon.figures import figures
 from ..addon.scanner import scanner
 from ..addon.volumes import volumes
 from ..core.errors import InputError
-from ..core.figures.kinds import FILMS, PAPERS, SAMPLES, Rendering
+from ..core.figures.kinds import FILMS, PAPERS, SAMPLES, Rendering, figure_kind
 from ..core.figures.page import LARGEST, SUFFIXES
 
-_PIXELS = {"description": "Pixels; 0: as suits the figure", "min": 0, "max": LARGEST, "subtype": "PIXEL"}
+_PIXELS = {"description": "Pixels; 0: Auto", "min": 0, "max": LARGEST, "subtype": "PIXEL"}
 _STYLES = ((name, name.title(), f"On {name} paper") for name in PAPERS)
 _SHOWN: reports.Need = (
     lambda context: scanner.active_scanner(context.scene) or volumes.volume_objects(context.scene),
     "Nothing to show: import a workbook or add a phantom first",
 )
+
+
+def _change_size(operator: Any, context: bpy.types.Context) -> None:
+    """Begin with the size that suits the figure where Auto is taken away."""
+    size = figure_kind(_kind_name(operator)).size
+    operator.width, operator.height = (0, 0) if operator.automatic else size
+
+
+def _kind_name(operator: Any) -> str:
+    """Return the name of the chosen kind of figure."""
+    return operator.figure.lower().replace("_", "-")
 
 
 class FigureOperator(jobs.ExportJob):
@@ -28,6 +39,7 @@ class FigureOperator(jobs.ExportJob):
     endings: tuple[str, ...] = SUFFIXES
     filepath: file_properties.file_property("File to write")
     filter_glob: file_properties.shown_files((*SUFFIXES, *FILMS))
+    automatic: BoolProperty(name="Auto", description="Size that suits the figure", default=True, update=_change_size)
     width: IntProperty(name="Width", **_PIXELS)
     height: IntProperty(name="Height", **_PIXELS)
     modules: StringProperty(
@@ -48,6 +60,13 @@ class FigureOperator(jobs.ExportJob):
         self.filepath = ids.label(type(self).__name__).split()[-1].lower() + self.endings[0]
         return super().ask(context)
 
+    def draw(self, context: bpy.types.Context) -> None:
+        """Draw the settings, the size only where it is not automatic."""
+        layout, operator = layouts.labelled(self.layout), cast(Any, self)
+        layout.row(heading="Size").prop(operator, "automatic")
+        names = ["figure", *(("width", "height") if operator.width else ()), "modules", *Rendering._fields]
+        layouts.draw_all(layout, operator, *(name for name in names if name in operator.properties.bl_rna.properties))
+
     def job(self, context: bpy.types.Context) -> jobs.Job:
         operator: Any = self  # the type checker does not know Blender's properties
         path = self.required_file(f"set filepath to a name ending in {' or '.join(self.endings)}")
@@ -55,8 +74,7 @@ class FigureOperator(jobs.ExportJob):
             raise InputError("size: give both width and height, or neither")
         size = (operator.width, operator.height) if operator.width else None
         style = {name: value for name, value in self.as_keywords().items() if name in Rendering._fields}
-        name = operator.figure.lower().replace("_", "-")
-        return figures.figure_job(context, name, [path], size, operator.modules or None, **style)
+        return figures.figure_job(context, _kind_name(operator), [path], size, operator.modules or None, **style)
 
 
 class MPHDRR_OT_export_figure(FigureOperator, bpy.types.Operator):

@@ -4,6 +4,7 @@ import re
 import tempfile
 import time
 from collections.abc import Generator, Sequence
+from functools import cache
 from pathlib import Path
 
 import bpy
@@ -11,16 +12,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...core import Cancelled
-from ...core.errors import InputError, first_line
+from ...core.errors import InputError, first_line, warn
 from ...core.figures.page import Page
 from ...core.files import write_bytes
 from ..blender import compat, ids, jobs
 
+_MORE_SAMPLES = 3  # factor of the rays per pixel where noise is not smoothed afterwards
 _PAUSE = 0.02  # s between two checks of Blender's render job
 _MAX_TRANSPARENT = 64  # number of surfaces of faded modules, one behind another, that stay transparent
 
 
-def set_up(scene: bpy.types.Scene, size: tuple[int, int], samples: int) -> None:
+def set_up(scene: bpy.types.Scene, size: tuple[int, int], samples: int, denoises: bool = True) -> None:
     """Set a scene up for rendering 8-bit colours by Cycles, the same on every machine."""
     render = scene.render
     try:
@@ -30,12 +32,24 @@ def set_up(scene: bpy.types.Scene, size: tuple[int, int], samples: int) -> None:
     cycles = scene.cycles
     cycles.device, cycles.samples, cycles.max_bounces, cycles.seed = "CPU", samples, 4, 0
     cycles.use_adaptive_sampling, cycles.adaptive_threshold, cycles.adaptive_min_samples = True, 0.05, 4
-    cycles.use_denoising, cycles.denoising_prefilter = True, "ACCURATE"
+    cycles.use_denoising = denoises and can_denoise()
+    if denoises and not cycles.use_denoising:
+        cycles.samples, cycles.adaptive_threshold = _MORE_SAMPLES * samples, 0.02
     (render.resolution_x, render.resolution_y), render.resolution_percentage = size, 100
     cycles.transparent_max_bounces = _MAX_TRANSPARENT
     render.image_settings.file_format, render.image_settings.color_mode = "PNG", "RGB"
     render.dither_intensity = 0.0
     scene.view_settings.view_transform = "Standard"
+
+
+@cache
+def can_denoise() -> bool:
+    """Return whether this build of Blender can smooth noise; warn once where it cannot."""
+    import _cycles  # Blender's own module, which is there only where Cycles is
+
+    if not _cycles.with_openimagedenoise:
+        warn(f"this Blender lacks OpenImageDenoise: pictures take {_MORE_SAMPLES} times the rays, and show some noise")
+    return bool(_cycles.with_openimagedenoise)
 
 
 def render_to_file(scene: bpy.types.Scene, path: Path, animation: bool = False) -> Generator[float, None, None]:

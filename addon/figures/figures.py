@@ -253,28 +253,19 @@ def _titles(stage: FigureScene) -> tuple[str, str]:
 
 
 def _is_drawn(item: bpy.types.Object) -> bool:
-    """Return whether Cycles draws anything of a volume in its look, by small pictures with and without it."""
+    """Return whether Cycles draws anything of a volume: its look's surfaces, else its smoke, by small pictures."""
+    if surfaces_of_look := looks.surfaces_of(item):
+        graph = bpy.context.evaluated_depsgraph_get()
+        return any(len(surface.evaluated_get(graph).data.polygons) for surface in surfaces_of_look)
     reach = max((item.matrix_world @ Vector(corner)).length for corner in item.bound_box) + 1.0
-    sizes, size = (
-        reach / np.array([50, 10, 10, 50, 1]),
-        (_SMALL_SIZE, _SMALL_SIZE),
-    )  # of a small module behind the volume
+    sizes, size = reach / np.array([50, 10, 10, 50, 1]), (_SMALL_SIZE,) * 2  # of a small module behind the volume
     subject = FigureSubject(PinholeSystem(-2 * reach * DIRECTION[None], *sizes))
     stage, pictures = FigureScene(subject, figure_kind("inside"), None, size, DARK), []
     try:
-        engine.set_up(stage.scene, size, SAMPLES)
-        stage.scene.cycles.use_denoising = False
-        shown = [stage.add_object(item.data)]
-        shown[0].matrix_world = item.matrix_world
-        for surface in looks.surfaces_of(item):  # its look draws surfaces instead of smoke
-            copy = surface.copy()
-            copy.data, copy.parent = surface.data.copy(), None
-            stage.scene.collection.objects.link(copy)
-            copy.matrix_world = surface.matrix_world
-            shown.append(copy)
-        for is_hidden in (True, False):
-            for part in shown:
-                part.hide_render = is_hidden
+        engine.set_up(stage.scene, size, SAMPLES, denoises=False)
+        smoke = stage.add_object(item.data)
+        smoke.matrix_world = item.matrix_world
+        for smoke.hide_render in (True, False):
             list(engine.render_to_file(stage.scene, path := storage.folder() / "small.png"))
             pictures.append(engine.read_pixels(path).astype(int))
     finally:

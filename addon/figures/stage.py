@@ -37,7 +37,6 @@ _RING = (0.55, 0.60, 0.66, 1.0)  # of the ROI's ring
 _COLOR, _SHINE, _DULL = "Color", 0.3, 0.6
 # Percentiles of the surface that is framed, and its least radius relative to the ROI's.
 _BULK, _LEAST = (5.0, 95.0), 0.2
-_ORIGINS = ("collimator", "source")  # parts from which rays begin
 _METALLIC_FACTOR = 0.3  # factor on the metallic look of materials, which would mirror the surroundings
 _GLOW, _TINT = 0.06, 0.45  # emission strength of lit modules, and share of the accent in their colour
 _WORLD = 0.5  # brightness of the surroundings, which metal reflects
@@ -73,7 +72,7 @@ class FigureScene:
         self.scene = scene = bpy.data.scenes.new(ids.STUDIO)
         self.radius = self.full_system.region_radius()
         self._materials = dict[tuple[str, bool], bpy.types.Material]()  # by the part's kind, and whether it fades
-        self._parts = list[tuple[bpy.types.Object, int, Points]]()  # each with its module's number, and its direction
+        self._parts = list[tuple[bpy.types.Object, int, Points]]()  # each with its module's number, and its place
         try:
             studio.furnish(scene)
             scene.frame_set(bpy.context.scene.frame_current)
@@ -117,17 +116,19 @@ class FigureScene:
         distance = float(np.array(self.camera.location) @ direction)
         self.pixels_per_mm = longer_side * self.studio.lens / _SENSOR_WIDTH / distance  # at the isocentre
         self.ray_numbers = rays
-        for part, number, outward in self._parts:
-            opacity = (
-                float(np.clip((_GONE - outward @ direction) / (_GONE - _SOLID), 0.0, 1.0)) if self.studio.cut else 1.0
-            )
-            if rays == [number]:
-                opacity = max(opacity, _MIN_OPACITY)
+        for part, number, place in self._parts:
+            opacity = self._opacity(place, direction, rays == [number])
             part.color = (_TINT * (number in lit and self.studio.lit), 0.0, 0.0, opacity)
             part.hide_render = not opacity
             part.data.materials[0] = self._materials[part["kind"], opacity < 1]
-            if number in self.rays and part["kind"] in _ORIGINS:
-                self.rays[number].hide_render = number not in rays or not opacity
+        for (number, ray), source in zip(self.rays.items(), self.system.poses()[:, :3, 3], strict=False):
+            ray.hide_render = number not in rays or not self._opacity(source, direction, rays == [number])
+
+    def _opacity(self, place: Points, direction: Points, is_alone: bool) -> float:
+        """Return the opacity of a part at a place, seen from a direction; one that `is_alone` lit never vanishes."""
+        facing = place @ direction / max(float(np.linalg.norm(place)), 1e-9)
+        fade = float(np.clip((_GONE - facing) / (_GONE - _SOLID), 0.0, 1.0)) if self.studio.cut else 1.0
+        return max(fade, _MIN_OPACITY * is_alone)
 
     def moment(self, fraction: float) -> Moment:
         """Return camera angle, lit modules and modules with rays after a fraction, 0 to 1, of the animation's time."""
@@ -141,28 +142,29 @@ class FigureScene:
         scene = self.scene
         items = list(scene.collection.all_objects)
         datablocks = {item.data for item in items if item.type != "VOLUME"}
-        materials = {
-            m for data in datablocks for m in getattr(data, "materials", ()) if m and m.name.startswith(ids.STUDIO)
-        }
-        materials.update(self._materials.values())
+        used = {material for data in datablocks for material in getattr(data, "materials", ()) if material is not None}
+        materials = {m for m in (*used, *self._materials.values()) if m.name.startswith(ids.STUDIO)}
         collections, world = list(scene.collection.children), scene.world
         bpy.data.scenes.remove(scene)
         bpy.data.batch_remove([*items, *datablocks, *materials, *collections, *filter(None, [world])])
 
     def _add_modules(self) -> None:
         """Add the parts of all modules, and the materials of whole and of fading parts."""
-        for part in self.system.parts(self.subject.construction):
-            if (part.kind, True) not in self._materials:
-                self._materials |= {
-                    (part.kind, fades): _figure_material(part.kind.upper(), fades) for fades in (False, True)
-                }
+        parts = self.system.parts(self.subject.construction)
+        parts = [
+            part for part in parts if part.kind != "panel" or not self.studio.near
+        ]  # they would fill near pictures
+        kinds = {part.kind for part in parts}
+        self._materials = {
+            (kind, fades): _figure_material(kind.upper(), fades) for kind in kinds for fades in (False, True)
+        }
+        for part in parts:
             mesh = bpy.data.meshes.new(ids.STUDIO)
             collimators.reshape_mesh(mesh, (part.vertices, part.solid[1]))
             mesh.materials.append(None)
             item = self.add_object(mesh)
             item["kind"] = part.kind
-            center = part.vertices.mean(axis=0)
-            self._parts.append((item, part.number, center / max(float(np.linalg.norm(center)), 1e-9)))
+            self._parts.append((item, part.number, part.vertices.mean(axis=0)))
 
     def _add_surface(self, surface: Surface) -> tuple[Points, float]:
         """Add the volume's surface, and return its centre and the radius, mm, within which nearly all of it lies."""
@@ -170,15 +172,12 @@ class FigureScene:
         colors = np.column_stack([surface.colors / 255, np.ones(len(surface.colors))]).astype(np.float32)
         item.data.attributes.new(_COLOR, "BYTE_COLOR", "POINT").data.foreach_set("color_srgb", colors.ravel())
         material, shader = compat.surface_material(ids.STUDIO, "ShaderNodeBsdfPrincipled")
-        color = compat.add_node(material.node_tree, "ShaderNodeAttribute", (-300, 0), attribute_name=_COLOR).outputs[
-            "Color"
-        ]
-        dulled = compat.add_node(
-            material.node_tree, "ShaderNodeVectorMath", (-150, 0), {0: color, "Scale": _DULL}, operation="SCALE"
-        )
-        material.node_tree.links.new(dulled.outputs[0], shader.inputs["Base Color"])
-        material.node_tree.links.new(color, shader.inputs["Emission Color"])
-        shader.inputs["Emission Strength"].default_value, shader.inputs["Roughness"].default_value = _SHINE, 0.45
+        add_node, link = partial(compat.add_node, material.node_tree), material.node_tree.links.new
+        color = add_node("ShaderNodeAttribute", (-400, 0), attribute_name=_COLOR).outputs["Color"]
+        dulled = add_node("ShaderNodeVectorMath", (-200, 0), {0: color, "Scale": _DULL}, operation="SCALE").outputs[0]
+        link(dulled, shader.inputs["Base Color"])
+        link(color, shader.inputs["Emission Color"])
+        shader.inputs["Emission Strength"].default_value = _SHINE
         item.data.materials.append(material)
         low, high = np.percentile(surface.mesh.vertices, _BULK, axis=0)
         center = (low + high) / 2
@@ -187,14 +186,9 @@ class FigureScene:
 
     def _add_rays(self) -> dict[int, bpy.types.Object]:
         """Return the principal rays by module number: thin shining tubes from each pinhole to the isocentre."""
-        centers = self.system.poses()[:, :3, 3]
-        return dict(
-            zip(
-                self.system.numbers.tolist(),
-                self._add_tubes(np.linspace(centers, 0 * centers, _SEGMENTS, axis=1), _ACCENT),
-                strict=True,
-            )
-        )
+        sources = self.system.poses()[:, :3, 3]
+        tubes = self._add_tubes(np.linspace(sources, 0 * sources, _SEGMENTS, axis=1), _ACCENT)
+        return dict(zip(self.system.numbers.tolist(), tubes, strict=True))
 
     def _add_tubes(
         self, lines: Iterable[Points], color: tuple[float, ...], is_closed: bool = False

@@ -1,4 +1,4 @@
-"""Volumes in rendered figures: closed surfaces in the colours of the values behind them.
+"""Volumes in rendered figures: closed surfaces in the colours of the values within them.
 
 A surface renders in seconds where smoke takes minutes, and looks the same in every build of Blender: the Cycles of Debian's
 draws no smoke.
@@ -6,6 +6,7 @@ draws no smoke.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import reduce
 
 import bpy
 import numpy as np
@@ -21,7 +22,7 @@ from ..volumes import looks, slices, stored_volumes, volume_materials
 
 _LEVEL = 0.25  # value of the surface of a volume that the window shows as smoke, as a fraction of its display range
 _MAX_VOXELS = 300  # along each side; a finer volume is coarsened
-_DEPTHS = np.arange(0.5, 4.5, 0.5)  # distances behind the surface, voxels, among which the highest value is found
+_REACH = 3  # voxels to each side among which the highest value gives a vertex its colour
 
 
 @dataclass(frozen=True)
@@ -55,7 +56,7 @@ def surface_maker(item: bpy.types.Object) -> Callable[[Volume, Progress], Surfac
     """Return a function that makes the surface of an object's volume in its look, without bpy, for a worker thread.
 
     The surface is that of the look, cut as in the window, or of smoke at a quarter of the display range. A vertex has the
-    colour of the highest value behind it, so that a rod has the colour of its core.
+    colour of the highest value within three voxels, so that a rod has the colour of its core.
     """
     settings, factor = item.mphdrr_volume, volume_materials.display_unit(item.mphdrr_volume.quantity)[1]
     window, unit, name = (settings.display_low, settings.display_high), settings.unit, item.name
@@ -75,11 +76,11 @@ def surface_maker(item: bpy.types.Object) -> Callable[[Volume, Progress], Surfac
             volume = _cut_open(volume, cut)
         while max(volume.grid.shape) > _MAX_VOXELS:
             volume = stored_volumes.coarsen(volume)
-        mesh = volume_to_mesh(volume, level, lambda done, total: progress(done, 2 * total))
-        values, inward = np.full(len(mesh.vertices), level, np.float32), -_normals(mesh) * volume.grid.spacing.min()
-        for index, depth in enumerate(_DEPTHS):
-            np.maximum(values, values_at(volume, mesh.vertices + depth * inward), out=values)
-            progress(len(_DEPTHS) + index, 2 * len(_DEPTHS))
+        mesh = volume_to_mesh(volume, level, progress)
+        peaks = volume.array
+        for axis in range(3):
+            peaks = reduce(np.maximum, (np.roll(peaks, step, axis) for step in range(-_REACH, _REACH + 1)))
+        values = values_at(Volume(peaks, volume.grid, volume.quantity), mesh.vertices)
         return Surface(mesh, display.colored(factor * values, window), display, window, level * factor, unit)
 
     return make
@@ -92,12 +93,3 @@ def _cut_open(volume: Volume, indices: Sequence[int]) -> Volume:
     front = tuple(slice(i + 1, None) if side else slice(i) for i, side in zip(indices, sides, strict=True))
     array[front] = outside_value(volume)
     return Volume(array, volume.grid, volume.quantity)
-
-
-def _normals(mesh: Mesh) -> NDArray[np.float64]:
-    """Return the outward unit normals (V, 3) of a mesh's vertices."""
-    a, b, c = mesh.vertices[mesh.faces.T]
-    areas = np.cross(b - a, c - a)
-    corners, count = mesh.faces.T.ravel(), len(mesh.vertices)
-    sums = np.stack([np.bincount(corners, np.tile(area, 3), count) for area in areas.T], axis=1)
-    return sums / np.maximum(np.linalg.norm(sums, axis=1, keepdims=True), 1e-30)

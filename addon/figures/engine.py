@@ -1,5 +1,6 @@
 """Blender as a renderer: scenes rendered by Cycles to pictures, and pictures joined to films."""
 
+import importlib
 import re
 import tempfile
 import time
@@ -45,11 +46,10 @@ def set_up(scene: bpy.types.Scene, size: tuple[int, int], samples: int, denoises
 @cache
 def can_denoise() -> bool:
     """Return whether this build of Blender can smooth noise; warn once where it cannot."""
-    import _cycles  # Blender's own module, which is there only where Cycles is
-
-    if not _cycles.with_openimagedenoise:
+    has_denoiser = bool(importlib.import_module("_cycles").with_openimagedenoise)  # Blender's own module
+    if not has_denoiser:
         warn(f"this Blender lacks OpenImageDenoise: pictures take {_MORE_SAMPLES} times the rays, and show some noise")
-    return bool(_cycles.with_openimagedenoise)
+    return has_denoiser
 
 
 def render_to_file(scene: bpy.types.Scene, path: Path, animation: bool = False) -> Generator[float, None, None]:
@@ -119,7 +119,7 @@ def write_film(pictures: Sequence[Path], path: Path, fps: int, page: Page) -> Ge
         render.ffmpeg.format, render.ffmpeg.codec, render.ffmpeg.constant_rate_factor = "MPEG4", "H264", "HIGH"
         with tempfile.TemporaryDirectory(prefix="mphdrr-") as folder:
             film = Path(folder) / "film.mp4"
-            yield from render_to_file(scene, film, animation=True)
+            yield from (None for _ in render_to_file(scene, film, animation=True))
             write_bytes(path, film.read_bytes())
     finally:
         bpy.data.scenes.remove(scene)

@@ -118,7 +118,8 @@ def figure_job(
         subject = FigureSubject(**subject_values, **read_values)
         if make_surface is None or subject.volume is None:
             return subject, None
-        return subject, make_surface(subject.volume, lambda done, total: progress(_READING * done // total, _PERCENT))
+        share = 0 if kind.motion else _READING
+        return subject, make_surface(subject.volume, lambda done, total: progress(share * done // total, _PERCENT))
 
     reel = Reel()
 
@@ -163,6 +164,7 @@ def draw_figure(
             if not kind.motion:
                 for share in _render_picture(stage, style, page):
                     yield _DRAWING, _READING + round((_PERCENT - _READING) * share), _PERCENT
+                yield _DRAWING, _PERCENT, _PERCENT
         finally:
             stage.remove()
     for path in () if kind.motion else paths:

@@ -21,7 +21,7 @@ from ...core.volumes.volume import outside_value
 from ..volumes import looks, slices, stored_volumes, volume_materials
 
 _LEVEL = 0.25  # value of the surface of a volume that the window shows as smoke, as a fraction of its display range
-_MAX_VOXELS = 300  # along each side; a finer volume is coarsened
+_MAX_VOXELS = 160  # along each side; a finer volume is coarsened
 _REACH = 3  # voxels to each side among which the highest value gives a vertex its colour
 
 

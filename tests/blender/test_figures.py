@@ -5,6 +5,7 @@ from __future__ import annotations
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import bpy
 import numpy as np
@@ -16,12 +17,15 @@ import mphdrr.core as mph
 from mphdrr.addon.blender import ids, jobs, storage
 from mphdrr.addon.cli import main
 from mphdrr.addon.cli.scene import save_scene
-from mphdrr.addon.figures import engine, figures, studio
+from mphdrr.addon.figures import engine, figures, studio, surfaces
 from mphdrr.addon.runs import rendering
 from mphdrr.addon.scanner import scanner, selection
 from mphdrr.addon.volumes import volumes
+from mphdrr.core.figures.kinds import KINDS
 from mphdrr.core.figures.page import Page
+from mphdrr.core.figures.parts import heading_height
 from mphdrr.core.recording import recorded_warnings
+from mphdrr.operators import figure
 
 from .conftest import datablocks, pixels, refused, update
 
@@ -301,6 +305,80 @@ def test_an_animation_that_is_ended_keeps_its_pictures(pictured, tmp_path, monke
     list(steps)
     assert bpy.data.movieclips.load(str(path)).frame_duration == 3
     assert sorted(found.name for found in tmp_path.iterdir()) == ["film-frames", "film.mp4"]
+
+
+def test_a_surface_lies_at_its_value_and_has_the_colours_of_what_it_encloses(scene):
+    """Two balls with values that fall linearly from their centres: 100 and 40 kBq/mL."""
+    grid = mph.Grid.centered(40, 2.0)
+    centers = np.array([[-20.0, 0, 0], [20.0, 0, 0]])
+    points = (grid.affine[:3, :3] @ np.indices(grid.shape).reshape(3, -1)).T + grid.affine[:3, 3]
+    distances = np.linalg.norm(points[:, None] - centers, axis=2)
+    values = (np.array([100.0, 40.0]) * np.clip(1 - distances / 8.0, 0, 1)).max(axis=1)
+    volume = mph.Volume(values.reshape(grid.shape).astype(np.float32), grid, "activity")
+    shares = []
+    surface = surfaces.surface_maker(volumes.add_volume(volume, "Balls"))(volume, lambda *step: shares.append(step))
+    assert surface.level == pytest.approx(0.25 * volume.array.max()) and shares[-1][0] == shares[-1][1]
+    left = surface.mesh.vertices[:, 0] < 0
+    for half, center, peak in ((left, centers[0], 100.0), (~left, centers[1], 40.0)):
+        radii = np.linalg.norm(surface.mesh.vertices[half] - center, axis=1)
+        assert np.abs(radii - 8 * (1 - surface.level / peak)).max() < 0.6, "mm, of a quarter of the voxels' size"
+        true_color = surface.display.colored(volume.array[grid_index(grid, center)], surface.window)
+        assert np.abs(surface.colors[half].astype(int) - true_color).max() <= 24, "a step of the palette in 16"
+
+
+def grid_index(grid: mph.Grid, point: np.ndarray) -> tuple[int, ...]:
+    return tuple(np.rint(grid.index_from_world[:3, :3] @ point + grid.index_from_world[:3, 3]).astype(int))
+
+
+def test_nothing_of_a_picture_is_under_its_title_and_its_colour_bar(pictured, dc_spect, tmp_path):
+    """The picture fills what they leave, and half of its height is the phantom."""
+    scanner.build_scanner(bpy.context.scene, dc_spect, replace=True)
+    draw("picture", tmp_path / "a.png", (480, 300), samples=1)
+    shown, top = picture(tmp_path / "a.png"), heading_height(Page(480, 300), 1)
+    is_paper = (np.abs(shown - PAPERS["dark"]) <= 4).all(axis=2)
+    assert is_paper[top - 2 : top].all(), "between the title and the picture"
+    assert not is_paper[top : top + 4].all(), "where modules begin"
+    right = max(column for column in range(480) if not is_paper[top : top + 20, column].all())
+    assert 400 < right < 460 and is_paper[top:, right + 1 : right + 5].all(), "between the picture and the colour bar"
+    red, green, blue = np.moveaxis(shown[top:, : right + 1], -1, 0)
+    rows = np.flatnonzero(((red - green > 40) | (red - blue > 60)).mean(axis=1) > 0.01)
+    assert 0.4 < np.ptp(rows) / (300 - top) < 0.9
+
+
+def test_the_progress_of_a_picture_goes_up_to_its_end_in_one_stage(pictured, tmp_path, monkeypatch):
+    grey = np.full((SIZE[1], SIZE[0], 3), 200, np.uint8)
+
+    def render(scene):
+        yield from (0.0, 0.25, 0.5, 1.0)
+        return grey
+
+    monkeypatch.setattr(figures, "_render_pixels", render)
+    job, done = figures.figure_job(bpy.context, "picture", [tmp_path / "a.png"], SIZE, labels=False), []
+    steps = job.finish(job.work(lambda *step: done.append((job.label, *step))))
+    done += list(steps)
+    shares = [n / total for _, n, total in done]
+    assert {label for label, *_ in done} == {job.label}
+    assert shares == sorted(shares) and shares[0] == 0 and shares[-1] == 1 and len(set(shares)) > 6
+
+
+def test_a_blender_without_denoiser_takes_more_rays_and_says_so_once(scene, monkeypatch):
+    monkeypatch.setitem(sys.modules, "_cycles", SimpleNamespace(with_openimagedenoise=False))
+    engine.can_denoise.cache_clear()
+    with recorded_warnings() as texts:
+        for _ in range(2):
+            engine.set_up(scene, (160, 120), 5)
+            assert not scene.cycles.use_denoising and scene.cycles.samples == 15
+    engine.can_denoise.cache_clear()
+    assert [text.split(":")[0] for text in texts] == ["this Blender lacks OpenImageDenoise"]
+
+
+def test_taking_auto_away_begins_with_the_size_that_suits_the_figure():
+    chosen = SimpleNamespace(figure="MOSAIC_WIDE", automatic=False)
+    figure._change_size(chosen, bpy.context)
+    assert (chosen.width, chosen.height) == KINDS["mosaic-wide"].size
+    chosen.automatic = True
+    figure._change_size(chosen, bpy.context)
+    assert (chosen.width, chosen.height) == (0, 0), "which is Auto"
 
 
 def test_animations_refuse_what_cannot_be(tmp_path, capsys):

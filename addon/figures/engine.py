@@ -105,7 +105,7 @@ def write_film(pictures: Sequence[Path], path: Path, fps: int, page: Page) -> Ge
         render.ffmpeg.format, render.ffmpeg.codec, render.ffmpeg.constant_rate_factor = "MPEG4", "H264", "HIGH"
         with tempfile.TemporaryDirectory(prefix="mphdrr-") as folder:
             film = Path(folder) / "film.mp4"
-            yield from render_to_file(scene, film, animation=True)
+            yield from (None for _ in render_to_file(scene, film, animation=True))
             write_bytes(path, film.read_bytes())
     finally:
         bpy.data.scenes.remove(scene)

@@ -69,7 +69,7 @@ def test_a_look_dragged_from_the_asset_browser_restyles_a_phantom(window):
     seen = window("looks")
     assert seen["materials"] == ["Derenzo activity", "mphDRR Fire"]
     before, after = seen["brightest"]
-    assert before[2] > before[1] and after[2] < after[1], "the slices go along: from pink to yellow"
+    assert before[1] > before[0] and after[1] < after[0], "the slices go along: from inferno's last colour to fire's"
     assert seen["slice"] == ["Slice"] and seen["high"] == 100.0
 
 

@@ -201,7 +201,8 @@ def test_slices_shells_and_maps(window, work_folder):
 @pytest.mark.alone
 def test_the_example_is_seen_and_tiles_planes_list_and_mosaic_show_one_module(window, work_folder):
     seen = window("display")
-    assert seen["seconds"] < 15 and seen["hidden"] == ["Camera", "Cube", "Light"]
+    assert seen["seconds"] < 15 and seen["hidden"][:3] == ["Camera", "Cube", "Light"], "and three lamps"
+    assert len(seen["hidden"]) == 6 and all("studio" in name for name in seen["hidden"][3:])
     assert seen["clicked"] == [30, 30] and seen["selected"] == [55, 55] and seen["planes"] == 80
     screen = pixels(seen["screen"])
 

@@ -32,7 +32,7 @@ def test_main_path_runs_in_the_window(window, work_folder):
     # The rods are drawn, also after the first save has moved their .vdb.
     screen = pixels(result["screen"])
     x, y = result["phantom_at"]
-    red, green, blue = screen[y - 30 : y + 30, x - 30 : x + 30].reshape(-1, 3).T
+    red, _, blue = screen[y - 30 : y + 30, x - 30 : x + 30].reshape(-1, 3).T
     assert np.mean((red > 110) & (red - blue > 40)) > 0.3, "in the mosaic's yellow"
 
 

@@ -23,7 +23,7 @@ _TISSUES = {  # low and high end of the display range and the surface's value, H
     "LUNG": ((-1000.0, 150.0, -190.0), (0.62, 0.20, 0.17)),
 }
 _ENERGY = 140.5  # keV; assumed for a volume of mu whose file names no energy
-_SURFACE_COLOR = 0.85  # place of a surface's colour among those of the ramp: activity is gold
+_SURFACE_COLOR = 0.9  # place of a surface's colour among those of the ramp: activity is yellow
 _MAX_SURFACE_VOXELS = 160  # along each side of the grid from which Blender makes a surface
 
 

@@ -186,7 +186,7 @@ def before_save(*_: object) -> None:
 
 
 def after_update(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None:
-    """Update the planes where a look has changed, and hide or show them with their volumes."""
+    """Update the planes where a look has changed, and hide or show them and surfaces with their volumes."""
     if scene != bpy.context.scene:
         return
     if depsgraph.id_type_updated("MATERIAL") or depsgraph.id_type_updated("NODETREE"):  # a look was replaced or edited
@@ -197,8 +197,8 @@ def after_update(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None
     if not depsgraph.id_type_updated("SCENE"):
         return
     for item in volumes.volume_objects(scene):
-        for plane in planes_of(item):
-            objects.change(plane, hide_viewport=not item.visible_get())
+        for part in (*planes_of(item), *looks.surfaces_of(item)):
+            objects.change(part, hide_viewport=not item.visible_get())
 
 
 def after_frame_change(scene: bpy.types.Scene, *_: object) -> None:

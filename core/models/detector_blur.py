@@ -3,8 +3,6 @@
 import math
 from typing import Any
 
-import numpy as np
-
 from ..arrays import Floats
 from ..geometry.grid import Grid
 from ..geometry.views import Views
@@ -23,7 +21,8 @@ def pixel_parts(model: Any, views: Views, grid: Grid) -> int:
     voxel = float(grid.voxel_volume ** (1 / 3)) * magnification
     pixels = [(m, side) for m in range(len(views)) for side in model.crystal_pitch(views, m)]
     return max(
-        _parts(_sigma(model, m) / side, hole[m] / side, voxel[m] / side, model.is_by_depth) for m, side in pixels
+        _parts(_sigma(model, m) / side, float(hole[m]) / side, float(voxel[m]) / side, model.is_by_depth)
+        for m, side in pixels
     )
 
 
@@ -58,8 +57,8 @@ def _parts(sigma: float, hole: float, voxel: float, is_by_depth: bool) -> int:
     """Return the number of parts of a pixel's side to blur apart, so that at most 0.3 % of the counts are misplaced.
 
     Means over whole pixels no longer say where in a pixel an edge was. `sigma` is the blur's standard deviation, `hole` and
-    `voxel` the widths of their shadows, all in pixels. The law was fitted to images of discs with such edges. More parts that
-    include the spline cost less than parts of several cells.
+    `voxel` the widths of their shadows, all in pixels. The law was fitted to images of discs with such edges. More parts
+    that include the spline cost less than parts of several cells.
     """
     width = math.hypot(hole, voxel)
     if sigma == 0:
@@ -70,5 +69,5 @@ def _parts(sigma: float, hole: float, voxel: float, is_by_depth: bool) -> int:
     misplaced = sharp * (1 + voxel / (3 * sigma)) ** -0.55 - 0.5
     widened = 1.0 if is_narrow else (15 / (width**0.5 * variance)) ** 0.4
     least = min(max(math.ceil(max(misplaced, widened)), 2 if sigma < 0.7 and not is_narrow else 1), 10)
-    more = range(least, 2 * least + 1 if is_by_depth and sigma * least > _WIDE else 0)
+    more = range(least, 2 * least + 1) if is_by_depth and least > 1 and sigma * least > _WIDE else ()
     return next((n for n in more if _includes_spline(sigma * n, hole * n)), least)

@@ -178,6 +178,8 @@ def test_a_ct_makes_way_for_its_attenuation_and_undo_brings_it_back(scene):
     bpy.ops.ed.undo_push(message="made")
     mu = bpy.data.objects["CT mu"]
     assert bpy.data.objects["CT"].hide_get() and not mu.hide_get() and mu.mphdrr_volume.look == "BONE"
+    update()
+    assert [child.name for child in bpy.data.objects["CT"].children if child.visible_get()] == []
     water = attenuation("water", 140.5)
     assert mu.mphdrr_volume.display_low < water < mu.mphdrr_volume.display_high < mu.mphdrr_volume.surface
     bpy.ops.ed.undo()

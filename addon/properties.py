@@ -29,7 +29,7 @@ from .phantoms import phantom_properties
 from .pictures import display_properties
 from .reconstruction import reconstruction_properties
 from .runs import projection_properties
-from .scanner import column_maps, columns
+from .scanner import column_maps, columns, scanner
 from .scanner.collimators import PARTS
 
 
@@ -101,7 +101,6 @@ class ScannerProperties(bpy.types.PropertyGroup):
     workbook: path_property("Workbook", "Workbook that was last read or written")
     sha256: StringProperty(name="SHA-256", description="Checksum of the workbook when it was read")
     n_modules: IntProperty(name="Modules", description="Number of modules when the scanner was imported", min=0)
-    quick_ranges: StringProperty(name="Ranges", description="Module ranges with a button, JSON", options={"HIDDEN"})
     source: StringProperty(name="Source", description="Workbook that the numbers come from, JSON", options={"HIDDEN"})
     plate_thickness: FloatProperty(
         name="Plate", description="Thickness of the aperture plates in mm", min=0.0, update=on_edit("scanner")
@@ -162,8 +161,11 @@ class GeometryProperties(bpy.types.PropertyGroup):
                              update=on_edit("scanner_chosen"))  # fmt: skip
     active_index: IntProperty(name="Active Module", description="Index in the list", update=on_edit("active_module"))
     all_at_once: BoolProperty(name="All Modules", description="Show and change all modules, not the active one alone")
-    first: IntProperty(name="First", description="First module number of the range", default=1)
-    last: IntProperty(name="Last", description="Last module number of the range", default=40)
+    visible: StringProperty(
+        name="Visible Modules", description="Numbers of the modules that are shown, such as 1-40, 45; empty: all",
+        get=scanner.visible_modules, set=scanner.show_visible_modules, search=scanner.suggested_ranges,
+    )  # fmt: skip
+    visible_problem: StringProperty(name="Problem", description="Reason why modules stay hidden", options={"SKIP_SAVE"})
     # Lines that `sight_lines.py` draws in the 3D views.
     show_rays: BoolProperty(name="Ray",
                             description="Draw the principal ray, through the isocentre to the virtual detector",

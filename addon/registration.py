@@ -20,7 +20,7 @@ from .events import event_notes
 from .figures import figures
 from .perspective import color_bar, epipolar_drawing, frustums
 from .phantoms import live_phantoms
-from .pictures import planes, recoloring, tiles
+from .pictures import images, planes, recoloring, tiles
 from .runs import preview, rendering, run_notes, runs
 from .scanner import following, framing, live_scanner, scanner, selection, sight_lines
 from .volumes import slices, volumes
@@ -107,6 +107,7 @@ MENUS.append((bpy.types.WM_MT_splash, _draw_splash))
 CONTEXT_MENUS = bpy.types.VIEW3D_MT_object_context_menu, bpy.types.OUTLINER_MT_object
 MENUS += [(menu, menus.draw_in_context_menu) for menu in CONTEXT_MENUS]
 
+_BEFORE_UNDO = (framing.before_undo, images.before_undo)
 _AFTER_UNDO = (recoloring.check, runs.after_update, live_scanner.after_undo, slices.after_undo, framing.after_undo)
 _AFTER_UPDATE = (
     live_scanner.after_update, selection.after_update, planes.after_update, frustums.after_update, slices.after_update,
@@ -121,10 +122,10 @@ _HANDLERS: dict[str, tuple[Any, ...]] = {
     "load_post": _AFTER_LOAD,
     "depsgraph_update_post": (*_AFTER_UPDATE, runs.after_update, preview.after_update),
     "frame_change_post": _AFTER_FRAME,
-    "undo_pre": (framing.before_undo,),
-    "redo_pre": (framing.before_undo,),
-    "undo_post": (*_AFTER_UNDO, preview.after_update),
-    "redo_post": (*_AFTER_UNDO, preview.after_update),
+    "undo_pre": _BEFORE_UNDO,
+    "redo_pre": _BEFORE_UNDO,
+    "undo_post": (images.after_undo, *_AFTER_UNDO, preview.after_update),
+    "redo_post": (images.after_undo, *_AFTER_UNDO, preview.after_update),
     "render_init": (figures.before_render,),
     "save_pre": (storage.before_save, slices.before_save),
     "save_post": (storage.after_save,),
@@ -168,7 +169,7 @@ UPDATES: dict[str, Callable[..., None]] = {
     "look": slices.look_changed,
     "sight_lines": sight_lines.redraw,
     "display": recoloring.display_changed,
-    "planes": planes.update,
+    "planes": planes.edited,
     "epipolar": epipolar_drawing.redraw,
     "active_run": rendering.active_run_changed,
     "modules_removed": _modules_removed,

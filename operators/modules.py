@@ -3,7 +3,7 @@
 import math
 
 import bpy
-from bpy.props import BoolProperty, EnumProperty, FloatProperty, IntProperty
+from bpy.props import BoolProperty, EnumProperty, FloatProperty, IntProperty, StringProperty
 
 from ..addon.blender import decimals, ids, jobs, reports
 from ..addon.scanner import following, maps, module_edits, scanner, selection
@@ -13,20 +13,19 @@ from ..addon.scanner.scanner_parts import modules_text
 class MPHDRR_OT_show_modules(selection.OnScanner, bpy.types.Operator):
     """Show or hide modules with their collimators and crystals, in the viewport and in renders."""
 
-    first: IntProperty(name="First", description="First module number of the range", default=1)
-    last: IntProperty(name="Last", description="Last module number of the range", default=1)
+    modules: StringProperty(name="Modules", description="Numbers of modules, such as 1-40, 45; empty: all")
     mode: EnumProperty(
-        name="Mode", description="What to do with the modules of the range and the others", default="ONLY",
+        name="Mode", description="What to do with these modules and the others", default="ONLY",
         items=[
-            ("ONLY", "Show Only", "Show the modules of the range and hide all others", 0),
-            ("SHOW", "Show", "Show the modules of the range; the others stay as they are", 1),
-            ("HIDE", "Hide", "Hide the modules of the range; the others stay as they are", 2),
+            ("ONLY", "Show Only", "Show these modules and hide all others", 0),
+            ("SHOW", "Show", "Show these modules; the others stay as they are", 1),
+            ("HIDE", "Hide", "Hide these modules; the others stay as they are", 2),
             ("ALL", "Show All", "Show all modules", 3),
         ],
     )  # fmt: skip
 
     def change(self, context: bpy.types.Context, collection: bpy.types.Collection) -> str:
-        return f"{ids.counted(scanner.show_modules(collection, self.first, self.last, self.mode), 'module')} visible"
+        return f"{ids.counted(scanner.show_modules(collection, self.modules, self.mode), 'module')} visible"
 
 
 class MPHDRR_OT_isolate_ring(selection.OnModules, bpy.types.Operator):

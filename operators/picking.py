@@ -128,13 +128,12 @@ class MPHDRR_OT_pick_window(eyedropper.Eyedropper, bpy.types.Operator):
         except InputError as error:
             self.report({"WARNING"}, reports.in_window(error))
             return False
-        self.report({"INFO"}, f"Window {self.end.lower()} is {number[1]:g} {mosaic['unit']}: {number[0]}")
+        self.report({"INFO"}, f"Window {self.end.lower()} is {number[1]:g} {tiles.unit()}: {number[0]}")
         return True
 
     def status_text(self, number: tuple[str, float] | None) -> str:
         """Return the status bar's text for the number under the mouse, if any."""
-        unit = (images.tiles(bpy.data.images.get(ids.MOSAIC)) or {}).get("unit", "")
-        text = f"{number[0]}: {number[1]:g} {unit}" if number else f"Click on {self.target_words}"
+        text = f"{number[0]}: {number[1]:g} {tiles.unit()}" if number else f"Click on {self.target_words}"
         return f"{text}   (click: window {self.end.lower()}; Esc: cancel)"
 
 

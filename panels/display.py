@@ -26,7 +26,7 @@ class _DisplayPanel:
             row = column.row(align=True)
             row.prop(settings, name, text=text)
             row.operator("mphdrr.pick_window", text="", icon="EYEDROPPER").end = name.upper()
-        column.prop(settings, "half")
+        column.prop(settings, "shown")
         if settings.problem:
             layout.label(text=settings.problem, icon="ERROR")
         _draw_totals(layout, context)
@@ -40,10 +40,10 @@ def _draw_totals(layout: bpy.types.UILayout, context: bpy.types.Context) -> None
         return
     column = layout.column(align=True)
     text = iface("{name}, central half ({unit})") if summary["half"] else "{name} ({unit})"
-    column.label(text=text.format(name=camera.name, unit=summary["unit"]), translate=False)
+    column.label(text=text.format(name=camera.name, unit=tiles.unit()).removesuffix(" ()"), translate=False)
     numbers = column.split(factor=0.4)
     numbers.active = False
-    total, maximum = (f"{summary[name][index]:.6g}" for name in ("totals", "maxima"))
+    total, maximum = (images.number_text(summary[name][index], 6) for name in ("totals", "maxima"))
     draw_facts(numbers, (summary["summed"].capitalize(), total), ("Maximum", maximum))
 
 

@@ -1,7 +1,5 @@
 """Sidebar, Geometry: the scanner and the list of its modules."""
 
-import json
-
 import bpy
 import numpy as np
 from bpy.app.translations import pgettext_iface as iface
@@ -67,10 +65,10 @@ class MPHDRR_PT_geometry(Folded, bpy.types.Panel):
         modules = iface("{count} in {rings} rings" if n_rings > 1 else "{count} in a ring")
         modules = modules.format(count=properties.count, rings=n_rings)
         draw_facts(layout.split(factor=0.34), ("Workbook", workbook), ("Modules", modules))
-        row = layout.row(align=True)
-        for first, last in json.loads(properties.quick_ranges or "[]"):
-            _draw_show(row, f"{first}-{last}", first, last, "ONLY")
-        _draw_show(row, "All", 0, 0, "ALL")
+        row, state = layout.split(factor=0.34), context.scene.mphdrr_geometry
+        row.label(text="Visible")
+        row.prop(state, "visible", text="", placeholder="All")
+        draw_text(layout, state.visible_problem, "ERROR")
         row = layout.row(align=True)
         row.operator("mphdrr.import_geometry", text="Import Workbook")
         row.operator("mphdrr.add_xray_system")
@@ -100,14 +98,6 @@ class MPHDRR_PT_modules(ScannerPanel, bpy.types.Panel):
     def draw_scanner(self, context: bpy.types.Context, collection: bpy.types.Collection) -> None:
         layout = self.layout
         state = context.scene.mphdrr_geometry
-        column = layout.column(align=True)
-        row = column.row(align=True)
-        layouts.draw_all(row, state, "first", "last")
-        row = column.row(align=True)
-        _draw_show(row, "Show Only", state.first, state.last, "ONLY")
-        _draw_show(row, "Show", state.first, state.last, "SHOW", icon="HIDE_OFF")
-        _draw_show(row, "Hide", state.first, state.last, "HIDE", icon="HIDE_ON")
-
         head = layout.row(align=True)
         head.active = False
         _draw_columns(head, "  Module", "b (mm)", "l (mm)" if pinholes.has_pinholes(kind_of(collection)) else "")
@@ -137,9 +127,3 @@ def _draw_columns(layout: bpy.types.UILayout, name: str, *numbers: str) -> None:
         cell = split.row()
         cell.alignment = "RIGHT"
         cell.label(text=text)
-
-
-def _draw_show(layout: bpy.types.UILayout, text: str, first: int, last: int, mode: str, icon: str = "NONE") -> None:
-    """Draw a button that shows or hides the modules from number `first` to `last`."""
-    button = layout.operator("mphdrr.show_modules", text=text, icon=icon)
-    button.first, button.last, button.mode = first, last, mode

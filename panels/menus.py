@@ -57,10 +57,6 @@ class MPHDRR_MT_modules(bpy.types.Menu):
         draw_commands(layout, import_geometry="IMPORT", add_xray_system="LIGHT_SPOT", export_geometry="EXPORT")
         draw_commands(layout, export_for_program="NONE")
         layout.separator()
-        state = context.scene.mphdrr_geometry
-        text = iface("Show Only Modules {first} to {last}").format(first=state.first, last=state.last)
-        show = layout.operator("mphdrr.show_modules", text=text)
-        show.first, show.last, show.mode = state.first, state.last, "ONLY"
         layout.operator("mphdrr.show_modules", text="Show All Modules", icon="HIDE_OFF").mode = "ALL"
         camera = selection.listed_module(context.scene)
         look = layout.operator("mphdrr.look_through_module", text="Look Through Active Module")

@@ -65,7 +65,7 @@ def _draw_numbers(layout: bpy.types.UILayout, item: bpy.types.Object) -> None:
         ("Volume", item.name),
         ("Voxels", " × ".join(map(str, settings.shape))),
         ("Size", " × ".join(f"{s:.3g}" for s in settings.spacing) + " mm"),
-        ("Values", f"{settings.minimum:.4g} to {settings.maximum:.4g} {settings.unit}".removesuffix(" 1")),
+        ("Values", volumes.range_text(settings.minimum, settings.maximum, settings.unit)),
         *([("State", volumes.state_text(item))] if item.data.is_sequence else []),
         ("File", volumes.file_note(item)),
     )

@@ -103,9 +103,7 @@ class MPHDRR_PT_advanced(Popover, bpy.types.Panel):
         for table in ("model", "frames", "detector", "compute"):
             rest = (setting for setting in panel_properties(settings, table) if setting[0] not in (*_MAIN, *_PHYSICS))
             layouts.draw_settings(column, settings, rest)
-        column.prop(settings, "all_modules")
-        if not settings.all_modules:
-            layouts.draw_all(column, settings, "first", "last")
+        column.prop(settings, "modules", placeholder="All")
         layout.operator("mphdrr.load_recipe", icon="FILE_FOLDER")
 
 

@@ -107,7 +107,7 @@ class Worker(threading.Thread):
         self.warnings: list[str] = []
         self.cancel = threading.Event()
         self.steps: Finishing | None = None
-        self._can_stop = False
+        self._can_stop = self.is_asked_about = False
 
     def run(self) -> None:
         """Do the work and keep its result or its error, with the warnings."""
@@ -124,14 +124,14 @@ class Worker(threading.Thread):
 
     @property
     def text(self) -> str:
-        """The stage in words, with its progress and the time that it has taken or still takes."""
+        """The stage in words, with its progress and the time that it has taken or still takes; short, for a sidebar."""
         stage_text, elapsed = self.stage[:1].upper() + self.stage[1:], time.monotonic() - self.stage_start
         if self.cancel.is_set():
             return f"{stage_text}: stopping"
         if self.total < 2:
             return f"{stage_text}, {elapsed:.0f} s" if elapsed > _ESTIMATE_AFTER else stage_text
-        stage_text = f"{stage_text} {self.done} of {self.total}"
-        if elapsed < _ESTIMATE_AFTER or not self.done:
+        stage_text += f" {self.done} of {self.total}" if self.total < 100 else f" {100 * self.share:.0f} %"
+        if elapsed < _ESTIMATE_AFTER or not 0 < self.done < self.total:
             return stage_text
         remaining = elapsed / self.done * (self.total - self.done)
         return f"{stage_text}, {duration_text(remaining)} left"
@@ -372,6 +372,8 @@ class JobOperator:
             _current = None
         elif self._run in _waiting:
             _waiting.remove(self._run)
+        for window in context.window_manager.windows if self._run and self._run.is_asked_about else ():
+            window.screen = window.screen  # closes menus: Blender does so where a window gets a screen, even its own
         _redraw(context)
 
     def _failed(self, error: BaseException) -> set[str]:
@@ -436,6 +438,7 @@ class MPHDRR_OT_cancel_job(reports.Reported, bpy.types.Operator):
             menu.layout.operator("mphdrr.cancel_job", text="Discard", icon="TRASH").number = worker.number
 
         context.window_manager.popup_menu(draw, title=f"{worker.label}: Stop?", icon="QUESTION")
+        worker.is_asked_about = True
         return {"CANCELLED"}
 
     def act(self, context: bpy.types.Context) -> None:

@@ -181,6 +181,15 @@ def picture_empty(name: str, parent: bpy.types.Object, picture: bpy.types.Image 
     return item
 
 
+def hide(*items: bpy.types.Object | None) -> list[int]:
+    """Hide objects by the eye beside their names and return the `session_uid` of those that were shown."""
+    layer = bpy.context.view_layer
+    shown = [item for item in items if item is not None and item.name in layer.objects and not item.hide_get()]
+    for item in shown:
+        item.hide_set(True)
+    return [item.session_uid for item in shown]
+
+
 def change(owner: Any, **values: Any) -> None:
     """Set only those properties that differ: setting one makes Blender calculate and draw the scene again."""
     for name, value in values.items():

@@ -187,7 +187,7 @@ def set_property(owner: Any, settings: Settings, name: str, value: Any) -> None:
         setattr(owner, name, ", ".join(f"{number:g}" for number in value or ()))
     elif isinstance(value, str) and value != "auto":
         property_name = material or name
-        setattr(owner, property_name, identifier(property_name, value))
+        setattr(owner, property_name, identifier(property_name, value) if setting.words else value)
     elif value not in (None, "auto"):
         setattr(owner, name, value)
 

@@ -82,7 +82,7 @@ def _make_scene(scene: Any, run: mph.ProjectionRun, out: Path) -> None:
         rendering.show_run(scene, run, out / "run.h5", item)
         save_scene(out / "scanner.blend")
     with _step("pictures"), quiet():
-        ranges = (f"{first}-{last}" for first, last in scanner.quick_ranges(run.system))
+        ranges = scanner.quick_ranges(run.system.numbers, run.system.rings())
         range_figures = [(f"modules-{modules}", "scanner", modules) for modules in ranges]
         for name, figure, modules in (*range_figures, *((name, kind, None) for name, kind in _FIGURES.items())):
             path = out / f"{name}.png"

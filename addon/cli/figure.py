@@ -126,15 +126,16 @@ def _draw_scene(
 def _render_figure(kind: FigureKind, page: Page, subject: FigureSubject, paths: list[Path], style: Rendering) -> None:
     """Draw a figure that Blender renders."""
     new_scene()
-    from ..figures import figures
+    from ..figures import figures, surfaces
     from ..volumes import volumes
 
     assert kind.studio is not None
-    item = None
+    surface = None
     if kind.studio.volume and subject.volume is not None:
         item = volumes.add_volume(subject.volume, subject.name or "Volume")
+        surface = surfaces.surface_maker(item)(subject.volume, progress_bar("reading"))
     with quiet():
-        _run_steps(figures.draw_figure(page, subject, kind, item, paths, style, figures.Reel()))
+        _run_steps(figures.draw_figure(page, subject, surface, kind, paths, style, figures.Reel()))
 
 
 def _run_steps(steps: Any) -> None:

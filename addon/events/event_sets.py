@@ -18,7 +18,7 @@ from ...core.events.templates import template_text
 from ...core.example import EXAMPLE
 from ...core.files import write_bytes
 from ...core.progress import Progress, stages_of
-from ..blender import jobs, storage
+from ..blender import jobs, objects, storage
 from ..figures import studio
 from ..phantoms import phantom_properties, phantoms
 from ..pictures import images
@@ -296,10 +296,9 @@ def _make_target(item: bpy.types.Object | None) -> _Target:
 def _select(item: bpy.types.Object, hidden_item: bpy.types.Object | None) -> None:
     """Select a volume, and hide another one at the same place."""
     bpy.context.view_layer.update()  # makes it include new objects
-    layer_objects = bpy.context.view_layer.objects
-    if hidden_item is not None and hidden_item != item and hidden_item.name in layer_objects:
-        hidden_item.hide_set(True)
-    if item.name in layer_objects:
+    if hidden_item != item:
+        objects.hide(hidden_item)
+    if item.name in bpy.context.view_layer.objects:
         item.hide_set(False)
         volumes.make_active(bpy.context, item)
 

@@ -1,5 +1,6 @@
 """Blender as a renderer: scenes rendered by Cycles to pictures, and pictures joined to films."""
 
+import re
 import tempfile
 import time
 from collections.abc import Generator, Sequence
@@ -19,7 +20,7 @@ _PAUSE = 0.02  # s between two checks of Blender's render job
 _MAX_TRANSPARENT = 64  # number of surfaces of faded modules, one behind another, that stay transparent
 
 
-def set_up(scene: bpy.types.Scene, page: Page, samples: int) -> None:
+def set_up(scene: bpy.types.Scene, size: tuple[int, int], samples: int) -> None:
     """Set a scene up for rendering 8-bit colours by Cycles, the same on every machine."""
     render = scene.render
     try:
@@ -30,15 +31,26 @@ def set_up(scene: bpy.types.Scene, page: Page, samples: int) -> None:
     cycles.device, cycles.samples, cycles.max_bounces, cycles.seed = "CPU", samples, 4, 0
     cycles.use_adaptive_sampling, cycles.adaptive_threshold, cycles.adaptive_min_samples = True, 0.05, 4
     cycles.use_denoising, cycles.denoising_prefilter = True, "ACCURATE"
-    render.resolution_x, render.resolution_y, render.resolution_percentage = page.width, page.height, 100
+    (render.resolution_x, render.resolution_y), render.resolution_percentage = size, 100
     cycles.transparent_max_bounces = _MAX_TRANSPARENT
     render.image_settings.file_format, render.image_settings.color_mode = "PNG", "RGB"
     render.dither_intensity = 0.0
     scene.view_settings.view_transform = "Standard"
 
 
-def render_to_file(scene: bpy.types.Scene, path: Path, animation: bool = False) -> Generator[None, None, None]:
-    """Yield while rendering a scene to a file; in a window by Blender's own job, which the status bar shows and Esc ends."""
+def render_to_file(scene: bpy.types.Scene, path: Path, animation: bool = False) -> Generator[float, None, None]:
+    """Yield the share of the samples that is done while rendering a scene to a file.
+
+    In a window, Blender's own job renders, which the status bar shows and Esc ends; where the user cancels ours, it ends
+    with that job.
+    """
+    is_cancelled, shares = False, [0.0]
+
+    def note(text: str, _: None = None) -> None:
+        """Note the share of the samples that Blender tells of."""
+        if sample := re.search(r"Sample (\d+)/(\d+)", text):
+            shares.append(int(sample[1]) / int(sample[2]))
+
     arguments = {"animation" if animation else "write_still": True, "scene": scene.name}
     scene.render.filepath = str(path)
     try:
@@ -53,10 +65,17 @@ def render_to_file(scene: bpy.types.Scene, path: Path, animation: bool = False) 
             view.render_display_type = old_display_type
     except RuntimeError as error:
         raise InputError(f"Blender cannot render the figure: {first_line(error)}") from error
-    while bpy.app.is_job_running("RENDER"):
-        time.sleep(_PAUSE)
-        yield
-    if not path.is_file():  # the user has pressed Esc
+    bpy.app.handlers.render_stats.append(note)
+    try:
+        while bpy.app.is_job_running("RENDER"):
+            time.sleep(_PAUSE)
+            try:
+                yield max(shares)
+            except Cancelled:
+                is_cancelled = True
+    finally:
+        bpy.app.handlers.render_stats.remove(note)
+    if is_cancelled or not path.is_file():  # the user has pressed Esc
         raise Cancelled
 
 
@@ -86,7 +105,7 @@ def write_film(pictures: Sequence[Path], path: Path, fps: int, page: Page) -> Ge
         render.ffmpeg.format, render.ffmpeg.codec, render.ffmpeg.constant_rate_factor = "MPEG4", "H264", "HIGH"
         with tempfile.TemporaryDirectory(prefix="mphdrr-") as folder:
             film = Path(folder) / "film.mp4"
-            yield from render_to_file(scene, film, animation=True)
+            yield from (None for _ in render_to_file(scene, film, animation=True))
             write_bytes(path, film.read_bytes())
     finally:
         bpy.data.scenes.remove(scene)

@@ -8,7 +8,6 @@ import sys
 import tempfile
 import threading
 from collections.abc import Callable, Generator, Sequence
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -16,23 +15,23 @@ from typing import Any
 import bpy
 import numpy as np
 from mathutils import Vector
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
-from ...core import PinholeSystem, Progress, files, read_run, recording, volume_to_mesh
+from ...core import PinholeSystem, Progress, files, read_run
 from ...core.cli.options import output_path
-from ...core.errors import InputError, warn
+from ...core.errors import InputError
 from ...core.figures.kinds import KINDS, SAMPLES, FigureKind, Rendering, figure_kind
-from ...core.figures.page import DARK, Page, box
+from ...core.figures.page import DARK, Page
 from ...core.figures.parts import bar_width, color_bar, heading, heading_height
 from ...core.figures.subject import FigureSubject, require
-from ...core.runs.display import Display, resize_picture
+from ...core.runs.display import resize_picture
 from ..blender import ids, jobs, storage, timers, windows
 from ..blender.choices import items
 from ..phantoms import phantoms
 from ..pictures import images
 from ..scanner import pinholes, scanner, selection
-from ..volumes import slices, volume_materials, volumes
-from . import engine
+from ..volumes import looks, volumes
+from . import engine, surfaces
 from .stage import DIRECTION, FigureScene
 
 Step = tuple[str, int, int] | None
@@ -47,11 +46,12 @@ _PAUSE = 0.5  # s between two checks of Blender's own render job
 # A volume is visible if it changes a small picture, so many pixels wide, by more than this, of 255.
 _SMALL_SIZE, _THRESHOLD = 240, 8
 _known_visible: set[tuple[str, str, float, float]] = set()  # files and looks of volumes that Cycles has drawn
-_UNDRAWN = "Low and High draw none of its values, or this Blender's Cycles draws no volumes"
-_UNSEEN = f": its file is missing, {_UNDRAWN}"
+_UNSEEN = ": its file is missing, Low and High draw none of its values, or this Blender's Cycles draws no volumes"
+_DRAWING = "Drawing the figure"
+_PERCENT = 100  # of the progress of a picture, of which the first part is the reading of what it shows
+_READING = 15
 _AXES = {"dark": ("#ff8a80", "#8ee59a", "#8cb8ff"), "light": ("#c62828", "#2e7d32", "#1f57c3")}  # x, y and z
 _STEPS = (1.0, 2.0, 5.0)  # leading digits of scale bars' lengths
-_VEIL = 0.7  # opacity of the paper under labels
 _BAR_SHARE = 0.2  # largest length of a scale bar, relative to the picture's width
 
 
@@ -59,18 +59,6 @@ class Reel(threading.Event):
     """Pictures of an animation so far; the event is set to end the animation with these."""
 
     pictures: Sequence[Path] = ()
-
-
-@dataclass(frozen=True)
-class _Ramp(Display):
-    """Colours of a volume's smoke."""
-
-    ramp: volume_materials.Ramp = ()
-
-    def colored(self, values: ArrayLike, window: tuple[float, float] | None = None) -> NDArray[np.uint8]:
-        """Return the colours (..., 3) of `values`, uint8, from the ramp's first to last number in `window`."""
-        table = np.rint(255 * slices.color_table("", self.ramp)[:, :3]).astype(np.uint8)
-        return table[np.rint(255 * self.shares(values, window or self.window(values))).astype(int)]
 
 
 def kind_items(films: bool = False) -> tuple[tuple[Any, ...], ...]:
@@ -110,6 +98,7 @@ def figure_job(
         subject_values["scanner"] = scanner.read_scanner(collection)
         subject_values["construction"] = pinholes.construction(collection.mphdrr_scanner)
     readers: dict[str, Callable[[], Any]] = {}
+    make_surface = None if item is None or kind.studio is None else surfaces.surface_maker(item)
     if item is not None:
         pose = volumes.pose_of_object(item)
         readers["volume"], subject_values["name"] = volumes.reader(item), item.name
@@ -120,19 +109,22 @@ def figure_job(
         readers["run"] = partial(read_run, storage.absolute(run_file))
     require(kind.needs, {*subject_values, *readers}, kind.name, _MISSING)
 
-    def work(progress: Progress) -> FigureSubject:
-        """Read what the figure needs from files, and return its subject."""
-        progress(0, 1)
+    def work(progress: Progress) -> tuple[FigureSubject, surfaces.Surface | None]:
+        """Read what the figure needs from files, and return its subject and its volume's surface."""
+        progress(0, _PERCENT)
         read_values = {key: read() for key, read in readers.items()}
         if "run" in read_values:
             subject_values["name"] = read_values["run"].settings.get("volume", "")
-        return FigureSubject(**subject_values, **read_values)
+        subject = FigureSubject(**subject_values, **read_values)
+        if make_surface is None or subject.volume is None:
+            return subject, None
+        return subject, make_surface(subject.volume, lambda done, total: progress(_READING * done // total, _PERCENT))
 
     reel = Reel()
 
-    def finish(subject: FigureSubject) -> Generator[Step, None, str]:
+    def finish(result: tuple[FigureSubject, surfaces.Surface | None]) -> Generator[Step, None, str]:
         """Draw the figure step by step, write and show it, and return the line to report."""
-        yield from draw_figure(page, subject, kind, item, paths, options, reel)
+        yield from draw_figure(page, *result, kind, paths, options, reel)
         if windows.has_window() and paths[0].suffix == ".png":
             images.show_file(paths[0], bpy.context)
         return f"Wrote {', '.join(map(str, paths))}"
@@ -142,103 +134,96 @@ def figure_job(
         pictures = reel.pictures
         return f"{len(pictures)} pictures are in {pictures[0].parent}" if pictures else "nothing was changed"
 
-    return jobs.Job("Drawing the figure", work, finish, finish_now=reel if kind.motion else None, leftovers=leftovers)
+    return jobs.Job(_DRAWING, work, finish, finish_now=reel if kind.motion else None, leftovers=leftovers)
 
 
 def draw_figure(
     page: Page,
     subject: FigureSubject,
+    surface: surfaces.Surface | None,
     kind: FigureKind,
-    item: bpy.types.Object | None,
     paths: Sequence[Path],
     style: Rendering,
     reel: Reel,
 ) -> Generator[Step, None, None]:
-    """Draw a figure on its page and write it to `paths`; yield while Blender's own job renders, and after each picture.
+    """Draw a figure on its page and write it to `paths`; yield the progress.
 
-    `item` is the object of the volume to render. A film's pictures, in the folder NAME-frames beside NAME.mp4, stay if the
+    `surface` is that of the volume to render. A film's pictures, in the folder NAME-frames beside NAME.mp4, stay if the
     work is ended; where `reel` is set, the film ends with the pictures so far.
     """
     if kind.draw is not None:
         kind.draw(page, subject)
     if kind.studio is not None:
-        stage = FigureScene(subject, kind, item, page, heading_height(page, 1) if style.labels else 0)
+        top, right = (heading_height(page, 1), _bar_room(page, surface)) if style.labels else (0, 0)
+        stage = FigureScene(subject, kind, surface, (page.width - right, page.height - top), page.paper)
         try:
-            yield from _set_up(stage, style)
+            engine.set_up(stage.scene, stage.size, style.samples)
             for path in paths if kind.motion else ():
-                yield from _render_film(stage, style, path, reel)
+                yield from _render_film(stage, style, path, page, reel)
             if not kind.motion:
-                yield from _render_picture(stage, style, page)
+                for share in _render_picture(stage, style, page):
+                    yield _DRAWING, _READING + round((_PERCENT - _READING) * share), _PERCENT
         finally:
             stage.remove()
     for path in () if kind.motion else paths:
         page.write(path)
 
 
-def _render_film(stage: FigureScene, style: Rendering, path: Path, reel: Reel) -> Generator[Step, None, None]:
+def _render_film(
+    stage: FigureScene, style: Rendering, path: Path, blank: Page, reel: Reel
+) -> Generator[Step, None, None]:
     """Render an animation's pictures, and join them to an MP4."""
     pictures = reel.pictures = []
     folder = files.ensure_folder(path.with_name(f"{path.stem}-frames"))
     for old_picture in folder.glob(f"{glob.escape(path.stem)}-[0-9][0-9][0-9][0-9].png"):
         old_picture.unlink()  # an older animation may have been longer
-    shown_moment, page = None, stage.page
+    shown_moment, page = None, blank
     for k in range(style.frames):
         if (moment := stage.moment(k / style.frames)) != shown_moment:
             stage.show(*moment)
-            shown_moment, page = moment, Page(page.width, page.height, page.paper)
-            yield from _render_picture(stage, style, page)
+            shown_moment, page = moment, Page(blank.width, blank.height, blank.paper)
+            yield from (None for _ in _render_picture(stage, style, page))
         pictures.append(folder / f"{path.stem}-{k + 1:04d}.png")
         page.write(pictures[-1])
-        yield "rendering pictures", k + 1, style.frames
+        yield "rendering", k + 1, style.frames
         if reel.is_set():
             break
     yield from engine.write_film(pictures, path, style.fps, page)
 
 
-def _set_up(stage: FigureScene, style: Rendering) -> Generator[None, None, None]:
-    """Set up Cycles for a figure's scene; a volume that Cycles does not draw becomes a surface, with a warning."""
-    engine.set_up(stage.scene, stage.page, style.samples)
-    item, volume = stage.item, stage.subject.volume
-    if item is None or not stage.volume_objects or (yield from _are_visible(stage.scene, stage.volume_objects)):
-        return
-    if volume is None:
-        warn(f"the picture shows nothing of {item.name!r}{_UNSEEN}")
-        return
-    settings, factor = item.mphdrr_volume, volume_materials.display_unit(item.mphdrr_volume.quantity)[1]
-    level = min((settings.display_low + settings.display_high) / factor, float(volume.array.max())) / 2
-    stage.draw_surface(volume_to_mesh(volume, level), volume_materials.item_ramp(item, smoke=True))
-    warn(f"the picture shows {item.name!r} as the surface at {level * factor:.3g} {settings.unit}: {_UNDRAWN}")
-
-
-def _render_picture(stage: FigureScene, style: Rendering, page: Page) -> Generator[None, None, None]:
-    """Render a figure's scene, as it is now, onto a page."""
-    page.image((yield from _render_pixels(stage.scene)), 0, 0, page.width, page.height)
+def _render_picture(stage: FigureScene, style: Rendering, page: Page) -> Generator[float, None, None]:
+    """Render a figure's scene, as it is now, onto a page below its title; yield the share that is done."""
+    width, height = stage.size
+    page.image((yield from _render_pixels(stage.scene)), 0, page.height - height, width, height)
     if style.labels:
         _label(stage, page)
 
 
+def _bar_room(page: Page, surface: surfaces.Surface | None) -> int:
+    """Return the width, pixels, that a surface's colour bar takes beside the picture."""
+    return 0 if surface is None else bar_width(page, surface.display, surface.window, surface.unit) + round(2 * page.em)
+
+
 def _label(stage: FigureScene, page: Page) -> None:
-    """Write title, axes, scale bar and colour bar on a picture."""
-    em, title, line = page.em, *_titles(stage)
-    if stage.studio.near:  # the scene reaches under the title
-        page.area(box(0, 0, page.width, stage.top), page.paper, _VEIL)
+    """Write title, axes, scale bar and colour bar around a picture."""
+    em, title, line, surface = page.em, *_titles(stage), stage.surface
     heading(page, title, [line], page.ink, page.faint)
     _draw_axes(page, stage.camera)
     if not stage.studio.volume:
         return
     longest = _BAR_SHARE * page.width / stage.pixels_per_mm
     length = max(n * 10.0**k for n in _STEPS for k in range(-3, 5) if n * 10.0**k <= longest)
-    end, row = 1.2 * em + length * stage.pixels_per_mm, page.height - 1.4 * em
-    page.area(box(0.6 * em, row - 2.2 * em, end, 3.0 * em), page.paper, _VEIL)
-    page.line([(1.2 * em, row), (end, row)], page.ink, 0.25 * em)
-    page.text(f"{length:g} mm", (1.2 * em + end) / 2, row - 0.6 * em, em, page.ink, "middle")
-    if stage.item is not None and [part.type for part in stage.volume_objects] == ["VOLUME"]:
-        settings = stage.item.mphdrr_volume
-        window = settings.display_low, settings.display_high
-        ramp = _Ramp(ramp=volume_materials.item_ramp(stage.item, smoke=True))
-        left, height = page.width - round(em) - bar_width(page, ramp, window, settings.unit), round(11 * em)
-        page.area(box(left - em, page.height - height - 4.2 * em, page.width, height + 4.2 * em), page.paper, _VEIL)
-        color_bar(page, ramp, window, settings.unit, left, page.height - height - round(1.4 * em), height)
+    end, row = page.width - 6.5 * em, 3.3 * em
+    start = end - length * stage.pixels_per_mm
+    page.line([(start, row), (end, row)], page.ink, 0.25 * em)
+    page.text(f"{length:g} mm", (start + end) / 2, row - 0.6 * em, em, page.ink, "middle")
+    if surface is not None:
+        left, height = (
+            page.width - _bar_room(page, surface) + round(em),
+            min(round(16 * em), stage.size[1] - round(5 * em)),
+        )
+        top = page.height - (stage.size[1] + height) // 2
+        color_bar(page, surface.display, surface.window, surface.unit, left, top, height)
 
 
 def _volume_item(context: bpy.types.Context) -> bpy.types.Object | None:
@@ -260,23 +245,42 @@ def _titles(stage: FigureScene) -> tuple[str, str]:
     listed += " …" if len(runs) > _MAX_RUNS else ""
     modules = f"{'Module' if len(numbers) == 1 else 'Modules'} {listed}"
     name, roi = stage.subject.name if stage.studio.volume else "", f"ROI of radius {stage.radius:g} mm"
+    if stage.surface is not None:
+        roi += f", surface at {stage.surface.level:.3g} {stage.surface.unit}"
     if stage.studio.lit:
         return name, f"Rays of {modules.lower()} of {len(stage.system)}, {roi}"
     return modules, ", ".join(filter(None, (name, roi)))
 
 
-def _are_visible(scene: bpy.types.Scene, items: list[bpy.types.Object]) -> Generator[None, None, bool]:
-    """Return whether objects are visible at all, by small pictures with and without them."""
-    render, cycles, pictures = scene.render, scene.cycles, []
-    render.resolution_percentage, cycles.use_denoising = min(100, -(-100 * _SMALL_SIZE // render.resolution_x)), False
-    samples, cycles.samples = cycles.samples, SAMPLES
-    for is_hidden in (True, False):
-        for item in items:
-            item.hide_render = is_hidden
-        pictures.append((yield from _render_pixels(scene)).astype(int))
-    render.resolution_percentage, cycles.use_denoising, cycles.samples = 100, True, samples
-    rows, columns = (n // 8 for n in pictures[0].shape[:2])  # means over blocks have less noise
-    return bool(np.abs(resize_picture(pictures[0] - pictures[1], rows, columns)).max() > _THRESHOLD)
+def _is_drawn(item: bpy.types.Object) -> bool:
+    """Return whether Cycles draws anything of a volume in its look, by small pictures with and without it."""
+    reach = max((item.matrix_world @ Vector(corner)).length for corner in item.bound_box) + 1.0
+    sizes, size = (
+        reach / np.array([50, 10, 10, 50, 1]),
+        (_SMALL_SIZE, _SMALL_SIZE),
+    )  # of a small module behind the volume
+    subject = FigureSubject(PinholeSystem(-2 * reach * DIRECTION[None], *sizes))
+    stage, pictures = FigureScene(subject, figure_kind("inside"), None, size, DARK), []
+    try:
+        engine.set_up(stage.scene, size, SAMPLES)
+        stage.scene.cycles.use_denoising = False
+        shown = [stage.add_object(item.data)]
+        shown[0].matrix_world = item.matrix_world
+        for surface in looks.surfaces_of(item):  # its look draws surfaces instead of smoke
+            copy = surface.copy()
+            copy.data, copy.parent = surface.data.copy(), None
+            stage.scene.collection.objects.link(copy)
+            copy.matrix_world = surface.matrix_world
+            shown.append(copy)
+        for is_hidden in (True, False):
+            for part in shown:
+                part.hide_render = is_hidden
+            list(engine.render_to_file(stage.scene, path := storage.folder() / "small.png"))
+            pictures.append(engine.read_pixels(path).astype(int))
+    finally:
+        stage.remove()
+    blocks = resize_picture(pictures[0] - pictures[1], *[_SMALL_SIZE // 8] * 2)  # whose means have less noise
+    return bool(np.abs(blocks).max() > _THRESHOLD)
 
 
 def before_render(scene: bpy.types.Scene, *_: Any) -> None:
@@ -302,13 +306,7 @@ def _report_unseen() -> float | None:
         elif item.data in missing:
             reason = ": its files are missing"
         elif scene.render.engine == "CYCLES" and key not in _known_visible:
-            reach = max((item.matrix_world @ Vector(corner)).length for corner in item.bound_box) + 1.0
-            sizes = reach / np.array([50, 10, 10, 50, 1])  # of a small module behind the volume
-            with recording.recorded_warnings() as warnings:
-                subject = FigureSubject(PinholeSystem(-2 * reach * DIRECTION[None], *sizes))
-                page, options = Page(_SMALL_SIZE, _SMALL_SIZE), Rendering(labels=False, samples=1)
-                list(draw_figure(page, subject, figure_kind("inside"), item, [], options, Reel()))
-            reason = _UNSEEN if any(_UNSEEN in text for text in warnings) else ""
+            reason = "" if _is_drawn(item) else _UNSEEN
             _known_visible.update([] if reason else [key])
         if reason:
             text = f"the picture shows nothing of {item.name!r}{reason}"
@@ -319,8 +317,8 @@ def _report_unseen() -> float | None:
     return None
 
 
-def _render_pixels(scene: bpy.types.Scene) -> Generator[None, None, NDArray[np.uint8]]:
-    """Return the colours (height, width, 3) of a rendered scene."""
+def _render_pixels(scene: bpy.types.Scene) -> Generator[float, None, NDArray[np.uint8]]:
+    """Return the colours (height, width, 3) of a rendered scene; yield the share that is done."""
     with tempfile.TemporaryDirectory(prefix="mphdrr-") as folder:
         path = Path(folder) / "figure.png"
         yield from engine.render_to_file(scene, path)

@@ -7,7 +7,7 @@ import gpu
 import numpy as np
 from gpu_extras.batch import batch_for_shader
 
-from ...core.runs.display import Display
+from ...core.runs.display import Display, number_text
 from ..blender import windows
 from ..volumes import slices, volume_materials, volumes
 from . import frustums
@@ -26,7 +26,7 @@ def labels(item: bpy.types.Object) -> tuple[str, dict[str, float]]:
     settings = item.mphdrr_volume
     title = f"{settings.quantity}, {settings.unit}".removesuffix(", 1")
     low, high = settings.display_low, settings.display_high
-    return title, {f"{value:.4g}": (value - low) / ((high - low) or 1.0) for value in Display().marks((low, high))}
+    return title, {number_text(value): (value - low) / ((high - low) or 1.0) for value in Display().marks((low, high))}
 
 
 def _bar_volume(context: bpy.types.Context) -> bpy.types.Object | None:

@@ -112,8 +112,9 @@ def resample_job(context: bpy.types.Context, cells: int, uniform: str) -> jobs.J
         item.mphdrr_volume.display_low, item.mphdrr_volume.display_high = display_range
         return f"Added {item.name!r}: {volumes.values_text(stored)}"
 
-    name, pose = f"{request.name} through {request.module}", volumes.pose_of_object(context.object)
-    return volumes.add_volume_job(name, make, name, finish, pose, provenance, context.object.users_collection[0])
+    name, item = f"{request.name} through {request.module}", context.object
+    pose, collection = volumes.pose_of_object(item), item.users_collection[0]
+    return volumes.add_volume_job(name, make, name, finish, pose, provenance, collection, [item])
 
 
 def _resample_to_frustum(

@@ -275,7 +275,11 @@ LOOKS = (
     ("BRIGHTEST", "Brightest", "The highest values shine through, as in a maximum intensity projection"),
     ("SHELL", "Shell", "The isosurface of a value: spheres, rods, the heart"),
     ("CUT", "Cut-Away", "The outer surface, cut open at the slices"),
-    ("BONE", "Bone", "Of a CT or mu: the bones' surface, and their window"),
+    (
+        "BONE",
+        "Bone",
+        "Of a CT or mu: the bones, in the skin that is cut open at the slices, and the window of soft tissue",
+    ),
     ("SOFT", "Soft Tissue", "Of a CT or mu: the skin, and the window of soft tissue"),
     ("LUNG", "Lung", "Of a CT or mu: where air begins, so that a cut shows the lungs, and their window"),
 )

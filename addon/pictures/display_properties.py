@@ -12,12 +12,22 @@ _SCALE_TEXTS = {
     "sqrt": ("Square Root", "Small numbers are told apart better; noise of counts looks the same everywhere"),
     "log": ("Logarithmic", "Colours in proportion to the numbers' logarithms, over three decades unless typed"),
 }
+_PARTS = choices.items({}, (
+    ("OBJECT", "Object", "In the mosaic the part around the middle that holds what is seen, elsewhere whole images"),
+    ("HALF", "Central Half", "The middle half of each image, often called FOV"),
+    ("WHOLE", "Whole Images", "All of each image, the wide FOV"),
+))  # fmt: skip
 _PLANES = (
     ("NONE", "None", "No planes"),
     ("ACTIVE", "Active", "The plane of the active module"),
     ("RING", "Ring", "The planes of the active module's ring"),
     ("ALL", "All", "The planes of all visible modules"),
 )
+
+
+def _show_part(self: bpy.types.PropertyGroup, number: int) -> None:
+    """Show the part of this number."""
+    self.half, self.whole = (number == part[3] for part in _PARTS[1:])
 
 
 class DisplayProperties(bpy.types.PropertyGroup):
@@ -36,9 +46,11 @@ class DisplayProperties(bpy.types.PropertyGroup):
     high: FloatProperty(
         name="High", description="Number with the last colour", default=1.0, update=updates.on_edit("display")
     )
-    half: BoolProperty(name="Central Half",
-                       description="Show the middle half of each image, often called FOV; all of it is the wide FOV",
-                       update=updates.on_edit("display"))  # fmt: skip
+    shown: EnumProperty(name="Show", description="Part of each image that the pictures show; the exact images stay whole",
+                        items=_PARTS, get=lambda self: _PARTS[1 if self.half else 2 * self.whole][3],
+                        set=_show_part)  # fmt: skip
+    half: BoolProperty(name="Central Half", options={"HIDDEN"}, update=updates.on_edit("display"))
+    whole: BoolProperty(name="Whole Images", options={"HIDDEN"}, update=updates.on_edit("display"))
     planes: EnumProperty(name="Planes", description="Modules whose projections stand in the scene",
                          items=choices.items({}, _PLANES), default="ALL", update=updates.on_edit("planes"))  # fmt: skip
     plane_distance: FloatProperty(name="Distance",
@@ -69,9 +81,9 @@ class DisplayProperties(bpy.types.PropertyGroup):
         return ""
 
     def display(self) -> Display:
-        """Return the colours, scale and window; raise `InputError` for an invalid window."""
+        """Return the colours, scale, window and shown part; raise `InputError` for an invalid window."""
         low, high = (None, None) if self.automatic else (self.low, self.high)
-        return Display(self.colors.lower(), self.scale.lower(), low, high, self.half)
+        return Display(self.colors.lower(), self.scale.lower(), low, high, self.shown.lower())
 
 
 CLASSES = (DisplayProperties,)

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from ...core import ProjectionRun, Views, memory
 from ...core.progress import Progress, part_of, tell
 from ...core.runs.display import Display
+from ...core.runs.display import number_text as number_text  # for panels
 from ...core.runs.exr import exr_bytes
 from ...core.runs.mosaic import MosaicSheet, as_seen, block_means, draw_sheet, module_labels, png_bytes
 from ..blender import ids, jobs, reports, windows
@@ -37,6 +38,8 @@ _TEXT = "mphdrr_difference"  # custom property of a difference: its numbers, in 
 _LABELS = "mphdrr_labels"  # custom property of the mosaic: the label of each tile, line by line
 _TILES = "mphdrr_tiles"  # custom property of the mosaic: its modules, its unit, and the position of each tile
 _VIEWS = "mphdrr_views"  # custom property of the mosaic: the run's views, as arrays of `Views`, and their ROI radii
+
+_shown: dict[bpy.types.Area, str] = {}  # names of the pictures that Image Editors showed before an undo or redo
 
 
 @dataclass(frozen=True)
@@ -144,9 +147,9 @@ def tiles(image: bpy.types.Image | None) -> dict[str, Any] | None:
     """Return the mosaic's tiles: `numbers` and `rings` of its modules, `unit`, tile size `tile` and `corners`; None without.
 
     Rows and columns count from the top left. `window` is that of the colours; `totals` are each image's "sum" or "mean", as
-    `summed` says, and `maxima` its largest number; `half` tells whether only the middle halves of the images are used and
-    shown. `display` is the display of all pictures, "None" while they are being made. Files of earlier versions lack these
-    six.
+    `summed` says, and `maxima` its largest number; `half` tells whether these are of the middle halves, which are shown;
+    `share` are the fractions of the images' width and height that the mosaic shows. `display` is the display of all
+    pictures, "None" while they are being made. Files of earlier versions lack these seven.
     """
     return None if image is None or _TILES not in image else image[_TILES].to_dict()
 
@@ -165,8 +168,9 @@ def mosaic_views(mosaic: bpy.types.Image) -> tuple[Views, NDArray[np.float64]] |
 
 
 def shown_fraction() -> tuple[float, float]:
-    """Return the fractions of the exact images' width and height that the pictures show."""
-    x, y = (tiles(bpy.data.images.get(ids.MOSAIC)) or {}).get("share", (1.0, 1.0))
+    """Return the fractions of the exact images' width and height that their pictures, but for the mosaic, show."""
+    shown = tiles(bpy.data.images.get(ids.MOSAIC)) or {}
+    x, y = shown["share"] if shown.get("half") else (1.0, 1.0)
     return x, y
 
 
@@ -321,6 +325,21 @@ def _editors(context: bpy.types.Context) -> list[tuple[bpy.types.Window, bpy.typ
             if area.type == "IMAGE_EDITOR" and space.mode == "VIEW" and (space.image is None or _KEY in space.image):
                 editors.append((window, area))
     return sorted(editors, key=lambda editor: editor[1].width * editor[1].height)
+
+
+def before_undo(*_: Any) -> None:
+    """Note the pictures in the free Image Editors: those whose image an undo or redo makes anew would show none."""
+    pictures = ((area, area.spaces.active.image) for _, area in _editors(bpy.context))
+    _shown.update({area: image.name for area, image in pictures if image is not None})
+
+
+def after_undo(*_: Any) -> None:
+    """Show pictures again in the editors that had them, when an undo or redo has brought them back."""
+    for window, area in _editors(bpy.context):
+        image = bpy.data.images.get(_shown.get(area, ""))
+        if image not in (None, area.spaces.active.image):
+            area.spaces.active.image = image
+            _fit(window, area)
 
 
 def editor_size(context: bpy.types.Context) -> tuple[int, int, float] | None:

@@ -17,8 +17,9 @@ from ..scanner import grabbing, scanner, selection
 from . import images
 
 _KEY = "mphdrr_field"
-"""Custom property of a plane: centre and size (5,) of the virtual detector in the camera's frame, mm."""
+"""Custom property of a plane: centre and size (5,) of the virtual detector, or just before a panel, in camera space, mm."""
 _ROUNDING = 1e-5  # relative rounding of a background's scale
+_BEFORE_PANEL = 0.99  # relative distance of a plane at a panel, whose own face would hide it
 _DEFAULT_SHARE = 0.3  # a plane's default distance from the pinhole, as a share of the distance to the ROI's surface
 
 
@@ -48,12 +49,12 @@ def show(scene: bpy.types.Scene, run: ProjectionRun, collection: bpy.types.Colle
             plane.mphdrr_module.part, plane.mphdrr_module.number = "PLANE", number
             planes_collection.objects.link(plane)
         else:
-            _remove_background(camera.data, plane.data)
-        plane.data, plane[_KEY] = picture, field.tolist()
+            _remove_backgrounds(plane)
+        plane.data, plane[_KEY] = picture, (field * (1.0 if "activity" in run.system.takes else _BEFORE_PANEL)).tolist()
         _set_background(camera.data, field, picture)
         shown_planes.append(plane)
     _remove(list(old.values()))
-    update(scene)
+    edited(scene)
     return shown_planes
 
 
@@ -68,11 +69,17 @@ def remove(scene: bpy.types.Scene, modules: list[bpy.types.Object] | None = None
     objects.remove_empty_collections(scene, ids.PLANES)
 
 
+def edited(scene: bpy.types.Scene) -> None:
+    """Show the planes as the scene's settings say after an edit of these; a reconstruction has hidden them."""
+    for plane in planes(scene):
+        plane.hide_set(False, view_layer=scene.view_layers[0])
+    update(scene)
+
+
 def _remove(unwanted: list[bpy.types.Object]) -> None:
     """Remove planes and their backgrounds."""
     for plane in unwanted:
-        if plane.parent is not None:
-            _remove_background(plane.parent.data, plane.data)
+        _remove_backgrounds(plane)
     bpy.data.batch_remove(unwanted)  # their pictures stay, which may be the user's
     objects.update_hidden_scenes()
 
@@ -87,6 +94,8 @@ def update(scene: bpy.types.Scene) -> None:
             continue
         _place(plane, settings, fractions)
         plane.color[3] = settings.plane_opacity
+        # At a detector, which is behind the ROI, it also faces whoever looks from the source.
+        plane.empty_image_side = "DOUBLE_SIDED" if settings.plane_at_detector else "BACK"
         for background in _backgrounds(plane):
             background.show_background_image = settings.backgrounds
             background.alpha = settings.plane_opacity
@@ -164,8 +173,7 @@ def _set_background(camera: bpy.types.Camera, field: NDArray[np.float64], pictur
     camera.show_background_images = True
 
 
-def _remove_background(camera: bpy.types.Camera, picture: bpy.types.Image | None) -> None:
-    """Remove a picture from a camera's view."""
-    for background in list(camera.background_images):
-        if background.image == picture:
-            camera.background_images.remove(background)
+def _remove_backgrounds(plane: bpy.types.Object) -> None:
+    """Remove a plane's picture from its camera's view, if it has a camera."""
+    for background in _backgrounds(plane) if plane.parent is not None else ():
+        plane.parent.data.background_images.remove(background)

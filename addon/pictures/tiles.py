@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ...core.errors import InputError
-from ...core.runs.display import Display
+from ...core.runs.display import Display, unit_text
 from ..blender import ids, windows
 from ..scanner import scanner, selection
 from . import images
@@ -29,8 +29,8 @@ class Picture:
     """Row and column of the picture's top left corner in the image, pixels."""
     size: tuple[int, int]
     """Numbers of the picture's rows and columns in the image, pixels."""
-    half: bool
-    """Whether the picture shows the projection's middle half."""
+    share: tuple[float, float] = (1.0, 1.0)
+    """Fractions of the projection's width and height, about its middle, that the picture shows."""
 
     def image_positions(self, pixels: ArrayLike, shape: tuple[int, int]) -> NDArray[np.float64]:
         """Return rows and columns (…, 2) in the image, from its top left, of columns and rows (…, 2) of the projection.
@@ -58,7 +58,7 @@ class Picture:
         Rows and columns decrease from the top left: whoever looks out of the pinhole, +v up, has +u to the left
         (`as_seen`).
         """
-        shown_shape = Display(half=self.half).part(np.empty(shape, np.bool_)).shape
+        shown_shape = [round(n * share) for n, share in zip(shape, self.share[::-1], strict=True)]
         # A picture pixel is a block of projection pixels, or the other way round; a last, smaller block is not shown.
         step = [n // size if n >= size else 1 / (size // n) for n, size in zip(shown_shape, self.size, strict=True)]
         return np.array(step), (np.array(shape) + shown_shape) / 2 - 0.5
@@ -69,17 +69,18 @@ def shown_pictures(image: bpy.types.Image | None) -> list[Picture]:
     if image is None or not images.is_ours(image):
         return []
     own_tiles = images.tiles(image)
-    run_tiles = images.tiles(bpy.data.images.get(ids.MOSAIC)) or {}
-    half = bool(run_tiles.get("half"))
     if own_tiles is not None:
+        share = tuple(own_tiles.get("share", (1.0, 1.0)))
         rows, columns = own_tiles["tile"]
         names = (images.projection_name(number, own_tiles["numbers"]) for number in own_tiles["numbers"])
         entries = zip(own_tiles["numbers"], names, np.reshape(own_tiles["corners"], (-1, 2)).tolist(), strict=True)
-        return [Picture(number, name, (row, column), (rows, columns), half) for number, name, (row, column) in entries]
+        return [Picture(number, name, (row, column), (rows, columns), share) for number, name, (row, column) in entries]
+    run_tiles = images.tiles(bpy.data.images.get(ids.MOSAIC)) or {}
+    share = (1.0, 1.0) if images.is_exact(image) else images.shown_fraction()
     exact_name = image.name.removesuffix(ids.picture_name(""))
     numbers = [n for n in run_tiles.get("numbers", ()) if images.projection_name(n, run_tiles["numbers"]) == exact_name]
     columns, rows = image.size
-    return [Picture(n, exact_name, (0, 0), (rows, columns), half and not images.is_exact(image)) for n in numbers]
+    return [Picture(n, exact_name, (0, 0), (rows, columns), share) for n in numbers]
 
 
 def picture_at(image: bpy.types.Image | None, x: float, y: float) -> tuple[Picture, tuple[float, float]] | None:
@@ -108,6 +109,11 @@ def value_at(image: bpy.types.Image | None, x: float, y: float) -> tuple[str, fl
     values = images.projection_array(exact)
     column, row = hit[0].pixel_at(hit[1], (values.shape[0], values.shape[1]))
     return f"{exact.name}, column {column}, row {row}", float(values[row, column])
+
+
+def unit() -> str:
+    """Return the unit of the shown run's images as people write it."""
+    return unit_text((images.tiles(bpy.data.images.get(ids.MOSAIC)) or {}).get("unit", ""))
 
 
 def pick_module(context: bpy.types.Context, x: float, y: float) -> str | None:

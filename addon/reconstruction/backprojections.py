@@ -8,7 +8,7 @@ import bpy
 from ...core import Recipe, backproject_run, read_run
 from ...core.progress import Progress, stages_of
 from ...core.runs.reconstructing import reconstruction_grid
-from ..blender import jobs, storage
+from ..blender import jobs, objects, storage
 from ..runs import rendering, runs
 from ..volumes import slices, stored_volumes, volumes
 from .reconstruction_properties import HOW_LABELS
@@ -38,9 +38,10 @@ def backproject_job(context: bpy.types.Context, recipe: Recipe, how: str) -> job
         """Add the back-projection to the scene, and return the line to report."""
         scene = jobs.require_scene(uid, "the back-projection is")
         item = volumes.add_stored(stored, f"{name} {label}", scene.collection)
+        objects.hide(runs.projected_volume(scene))
         volumes.make_active(bpy.context, item)
         slices.add_slices(item)  # as smoke it would be a cloud: few of its voxels are 0
         seconds = time.perf_counter() - start
-        return f"Back-projected {item.name!r}: {stored.low:.4g} to {stored.high:.4g}, in {seconds:.1f} s"
+        return f"Back-projected {item.name!r}: {volumes.range_text(stored.low, stored.high, '1')}, in {seconds:.1f} s"
 
     return jobs.Job("Back-projecting", work, finish)

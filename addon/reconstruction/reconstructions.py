@@ -33,11 +33,11 @@ from ...core.runs.mosaic import png_bytes
 from ...core.runs.recipe import recipe_from_tables
 from ...core.runs.reconstructing import reconstruct_run, reconstruction_grid, voxels_text
 from ...core.runs.run_recipe import run_truth
-from ...core.volumes.sights import bright_value, full_slices
+from ...core.volumes.sights import full_slices
 from ..blender import ids, jobs, objects, storage, windows
-from ..pictures import images
+from ..pictures import images, planes
 from ..runs import rendering, runs
-from ..volumes import slices, stored_volumes, volume_materials, volumes
+from ..volumes import looks, slices, stored_volumes, volumes
 
 _MIN_INTERVAL = 2.0  # s between two pictures of a running reconstruction
 _PNG_LEVEL = 1  # fast compression
@@ -52,6 +52,7 @@ class _ShownState:
 
     stored: stored_volumes.StoredVolume
     picture: bytes  # PNG of slices, beside the truth if there is one, and the objective
+    window: tuple[float, float]  # values of the slices' first and last colours
     record: dict[str, Any]  # see `ReconstructionProperties.details`
 
 
@@ -130,10 +131,10 @@ def _make_job(
                 "name": method.objective, "objective": list(objective), "voxels": voxels_text(grid),
                 "scores": [], "rods": [], "flatters": flatters, **scores, "run": path.name,
             }  # fmt: skip
-            picture = _draw_picture(run, volume, record, name, live.editor_size)
+            picture, window = _draw_picture(run, volume, record, name, live.editor_size)
             stored = stored_volumes.store_volume(volume, folder, None, {"reconstruction_of": name, **recipe.tables()})
             live.files.append(stored.path)
-            return _ShownState(stored, picture, record)
+            return _ShownState(stored, picture, window, record)
 
         def watch(iteration: int, values: NDArray[Any], objective: Sequence[float]) -> bool:
             """Make the volume of an iteration ready to be shown, at most every few seconds; return whether to stop."""
@@ -159,6 +160,7 @@ def _make_job(
         state, reconstruction = result
         item = live.show(state)
         volumes.make_active(bpy.context, item)
+        item.select_set(False)  # its box would stand around the rods
         slices.add_slices(item, full_slices(reconstruction.volume.array).tolist())
         images.show_below(bpy.data.images[ids.RECONSTRUCTION], bpy.context)
         storage.remove_results(live.files)
@@ -201,27 +203,21 @@ class _LiveResult:
         item = jobs.find_by_uid(bpy.data.objects, self._item)
         if not self._is_shown:
             self._is_shown = True
-            self._hide(runs.projected_volume(scene), scene.mphdrr_reconstruction.volume if item is None else None)
+            old = scene.mphdrr_reconstruction.volume if item is None else None
+            self._hidden = objects.hide(runs.projected_volume(scene), old, *planes.planes(scene))
         if item is None:  # first state, or the user has deleted the object
             item = volumes.add_stored(state.stored, self.name, scene.collection)
             self._item = item.session_uid
+            if item.mphdrr_volume.quantity == "activity":
+                item.mphdrr_volume.look = "SHELL"
         else:
             volumes.replace_stored(item, state.stored)
-        factor = volume_materials.display_unit(item.mphdrr_volume.quantity)[1]
-        bright_end = factor * bright_value(state.stored.volume.array)
-        if bright_end > 0:  # a single hot voxel would make all others dark
-            item.mphdrr_volume.display_high = bright_end
+        if state.window[0] < state.window[1]:
+            volumes.set_display_range(item, *state.window)
         images.store_png(ids.RECONSTRUCTION, state.picture)
         settings = scene.mphdrr_reconstruction
         settings.volume, settings.record = item, json.dumps(state.record)
         return item
-
-    def _hide(self, *items: bpy.types.Object | None) -> None:
-        """Hide the objects that stand where the reconstruction is; the eye beside their names shows them again."""
-        for item in items:
-            if item is not None and item.name in bpy.context.view_layer.objects and not item.hide_get():
-                item.hide_set(True)
-                self._hidden.append(item.session_uid)
 
     def clear(self) -> None:
         """Restore scene and files as they were before the job."""
@@ -232,6 +228,7 @@ class _LiveResult:
             volumes.replace_stored(item, self._previous.stored)
         elif item is not None:
             materials = list(item.data.materials)
+            looks.remove_surface(item)
             objects.remove_objects([item, *item.children])
             objects.remove_unused(materials)
         scene = jobs.find_by_uid(bpy.data.scenes, self._scene)
@@ -263,15 +260,18 @@ def _scores(run: ProjectionRun, volume: Volume, progress: Progress | None) -> di
 
 def _draw_picture(
     run: ProjectionRun, volume: Volume, record: dict[str, Any], name: str, editor_size: tuple[int, int, float] | None
-) -> bytes:
-    """Return a PNG of slices and objective that fills an editor: width and height, pixels, and Blender's scale of texts."""
+) -> tuple[bytes, tuple[float, float]]:
+    """Return a PNG of slices and objective that fills an editor, and the values of the slices' first and last colours.
+
+    `editor_size` is the editor's width and height, pixels, and Blender's scale of texts.
+    """
     page = Page(*(SIZE if run.volume is None else SIZE_BESIDE_TRUTH), DARK)
     if editor_size is not None and min(editor_size[:2]) >= SMALLEST:
         page = Page(*editor_size[:2], DARK, _TEXT * editor_size[2])
     line = ", ".join([record["title"], *map(" ".join, record["scores"][:1]), record["voxels"]])
     lines, title = [line, *record["flatters"]], f"Reconstruction of {name}"
-    draw(page, volume, record["objective"], run.volume, title, lines, record["name"], record["rods"])
-    return png_bytes(page.picture, _PNG_LEVEL)
+    window = draw(page, volume, record["objective"], run.volume, title, lines, record["name"], record["rods"])
+    return png_bytes(page.picture, _PNG_LEVEL), window
 
 
 def _mu_readers(scene: bpy.types.Scene) -> dict[str, Callable[[], Volume]]:

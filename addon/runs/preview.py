@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from ...core import InputError, PinholeSystem, ProjectionRun, Recipe, Views, Volume
 from ...core.geometry.scanner import Scanner
 from ...core.memory import readable_size
-from ...core.runs.display import Display
+from ...core.runs.display import Display, number_text
 from ...core.runs.mosaic import as_seen, fit_images, image_totals
 from ...core.runs.run_recipe import recipe_model, recipe_views, run_recipe
 from ..blender import jobs, reports, timers, windows
@@ -125,14 +125,15 @@ def make_preview(request: Request, quick: bool, voxels: dict[Path, Volume]) -> P
     if run.unit == "counts" and quick:  # counts per pixel of the panel's size, as in the full picture
         projections = projections * np.float32(_pixel_area(recipe_views(recipe, system)) / _pixel_area(run.views))
     word, (total,) = image_totals(display.part(run.projections), run.unit)
-    low, high = window = display.window(projections)
+    window = display.window(projections)
     shown_part = display.part(projections)
     picture = display.colored(fit_images(as_seen(shown_part), _SHOWN_PIXELS)[0], window)
     bar = [display.value_at(share, window) for share in np.linspace(0.0, 1.0, 256)]
     colors = display.colored([bar], window)
     rows, columns = run.views.shape
     title, *notes = request.lines
-    lines = (title, f"{columns} × {rows} pixels, {word} {total:.4g}", f"{low:.4g} to {high:.4g} {run.unit}", *notes)
+    size_line = f"{columns} × {rows} pixels, {word} {number_text(total)}"
+    lines = (title, size_line, volumes.range_text(*window, run.unit), *notes)
     corners = None if request.share is None else _corners(run.views, shown_part.shape[1:], request.share)
     return Preview(run, picture, colors, window, corners, lines, quick)
 

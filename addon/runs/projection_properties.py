@@ -8,7 +8,7 @@ from typing import Any
 import bpy
 from bpy.props import BoolProperty, CollectionProperty, IntProperty, PointerProperty, StringProperty
 
-from ...core.errors import InputError, expecting
+from ...core.errors import InputError
 from ...core.physics.maps import MAPS
 from ...core.runs.presets import PRESETS
 from ...core.runs.recipe import Recipe, fitting_recipe
@@ -30,10 +30,11 @@ _NAMES = {"model.kind": "model", "detector.plane": "detector", "detector.rows": 
           "frames.times": "frame_times", "frames.starts": "frame_starts"}  # fmt: skip
 """Names of properties in .blend files that differ from the names of their settings."""
 
+_TABLES = ("system.modules", "model.", "detector.", "frames.", "compute.")
 PROPERTIES = {
     _NAMES.get(key, key.partition(".")[2]): setting
     for key, setting in SETTINGS.items()
-    if key.startswith(("model.", "detector.", "frames.", "compute.")) and key not in (OPENING_ANGLE, "frames.bins")
+    if key.startswith(_TABLES) and key not in (OPENING_ANGLE, "frames.bins")
 }
 """The panel's settings by property name; an attenuation coefficient has a second property for its material."""
 
@@ -43,8 +44,9 @@ class ProjectionSettings:
 
     noise: BoolProperty(name="Poisson Noise", description="Draw Poisson counts instead of expected counts")
     seed: IntProperty(name="Seed", description="Seed of the noise: it determines the drawn counts", default=1, min=0)
-    first: IntProperty(name="First Module", description="Number of the first module; 0: the lowest", default=0, min=0)
-    last: IntProperty(name="Last Module", description="Number of the last module; 0: the highest", default=0, min=0)
+    # Of earlier versions' files and scripts; `modules` stands for them.
+    first: IntProperty(name="First Module", description="0: the lowest", default=0, min=0, options={"HIDDEN"})
+    last: IntProperty(name="Last Module", description="0: the highest", default=0, min=0, options={"HIDDEN"})
 
 
 ProjectionSettings.__annotations__.update(setting_properties.make_properties(PROPERTIES))
@@ -68,9 +70,9 @@ def settings_recipe(
     `get` returns a property's value, `is_set` whether a script has set it: `InputError` then if it has no effect. Images of
     a scanner `collection` with fixed pixels have these, unless a script has set others.
     """
-    first, last = get("first"), get("last")
-    modules = f"{first or ''}-{last or ''}" if first or last else None
-    values = {**recipe_values(get), **extra, "system.modules": modules}
+    values = {**recipe_values(get), **extra}
+    if is_set("first") or is_set("last"):
+        values["system.modules"] = _range_text(get) or None
     if fixed_pixels := collection and scanner.fixed_pixels(collection):
         pixels = {"height": fixed_pixels[0], "width": fixed_pixels[1]}
         names = [name for name, setting in PROPERTIES.items() if setting.key.startswith("detector.")]
@@ -84,16 +86,17 @@ def settings_recipe(
     return fitting_recipe(values, set_keys)
 
 
+def _range_text(get: Callable[[str], Any]) -> str:
+    """Return the range of modules of an earlier version's file or script as text; 0 is the lowest or the highest number."""
+    return f"{get('first') or ''}-{get('last') or ''}" if get("first") or get("last") else ""
+
+
 def set_panel(settings: ProjectionProperties, recipe: Recipe) -> None:
     """Set the panel to a recipe's values, all else to its defaults; raise `InputError` for what the panel cannot show."""
     if recipe["model.pixel_points"] == "auto" and recipe["model.kind"] != "emission":
         raise InputError("model.pixel_points: the panel has no automatic number for radiographs")
     if recipe["frames.bins"] is not None:
         raise InputError("frames.bins: the panel has one bin")
-    text = recipe["system.modules"] or "-"
-    first, dash, last = text.partition("-")
-    with expecting(f"system.modules: the panel has one range of modules, not {text!r}"):
-        modules = int(first or 0), int(last or 0) if dash else int(first)
     for name, setting in PROPERTIES.items():
         set_property(settings, PROPERTIES, name, recipe.given.get(setting.key))
     settings.fitted = ""  # keeps the recipe's model, whatever the volume's quantity
@@ -101,7 +104,6 @@ def set_panel(settings: ProjectionProperties, recipe: Recipe) -> None:
     settings.noise = recipe["noise.seed"] is not None
     if settings.noise:
         settings.seed = recipe["noise.seed"]
-    settings.first, settings.last = modules
 
 
 def use_preset(settings: ProjectionProperties, preset: str) -> None:
@@ -172,16 +174,14 @@ def _volume_chosen(self: ProjectionProperties, context: bpy.types.Context) -> No
         fit_model(self, volumes.quantity_of(self.volume))
 
 
-def _projects_all(self: ProjectionProperties) -> bool:
-    """Return whether all modules are projected."""
-    return self.first == self.last == 0
+def _chosen_modules(self: ProjectionProperties) -> str:
+    """Return the numbers of the modules that are projected, also those of an earlier version's range."""
+    return _range_text(lambda name: getattr(self, name)) or str(self.numbers)
 
 
-def _project_all(self: ProjectionProperties, value: bool) -> None:
-    """Choose all modules, or the range of all numbers of the active scanner."""
-    collection = None if value else scanner.active_scanner(self.id_data)
-    numbers = [camera.mphdrr_module.number for camera in scanner.modules(collection)] if collection else []
-    self.first, self.last = (min(numbers), max(numbers)) if numbers else (0, 0 if value else 1)
+def _choose_modules(self: ProjectionProperties, text: str) -> None:
+    """Choose the modules that are projected, in place of an earlier version's range."""
+    self.numbers, self.first, self.last = text, 0, 0
 
 
 class ProjectionProperties(ProjectionSettings, bpy.types.PropertyGroup):
@@ -190,8 +190,11 @@ class ProjectionProperties(ProjectionSettings, bpy.types.PropertyGroup):
     volume: PointerProperty(name="Volume", description="Volume to project; empty: the active volume, or the only one",
                             type=bpy.types.Object, update=_volume_chosen, poll=lambda self, item:
                             volumes.is_volume(item) and volumes.quantity_of(item) not in MAPS)  # fmt: skip
-    all_modules: BoolProperty(name="All Modules", description="Project into every module, not a range of numbers",
-                              get=_projects_all, set=_project_all)  # fmt: skip
+    modules: StringProperty(
+        name="Modules", description="Numbers of the modules to project into, such as 1-40, 45; empty: all",
+        get=_chosen_modules, set=_choose_modules, search=scanner.suggested_ranges,
+    )  # fmt: skip
+    numbers: StringProperty(name="Numbers", description="The text in Modules", options={"HIDDEN"})
     fitted: StringProperty(name="Fitted", description="Model chosen for the volume's quantity", options={"HIDDEN"})
     mu: PointerProperty(
         name="Attenuation", description="Volume of attenuation coefficients (1/mm) before the pinhole, or of CT numbers, "

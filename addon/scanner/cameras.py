@@ -112,5 +112,5 @@ def set_up_camera(camera: bpy.types.Camera, field: Field, distance: float) -> No
     set_field_of_view(camera, field)
     camera.clip_start = min(1.0, 0.01 * distance)
     camera.clip_end = 40.0 * distance
-    camera.display_size = 0.3 * abs(field[3])
+    camera.display_size = 0.025 * distance  # small: those of all modules would hide what they see
     camera.passepartout_alpha = 0.9

@@ -1,4 +1,4 @@
-"""Views of the 3D editors on a scanner: the whole scanner beside the sidebar, and the former view after an undo.
+"""Views of the 3D editors on a scanner: the scanner, or its middle, beside the sidebar, and the former view after an undo.
 
 Blender's undo leaves the views as they are, so the changes that an import made to them are stored here.
 """
@@ -13,14 +13,28 @@ from mathutils import Quaternion, Vector
 _SENSOR_SIZE = 72.0  # mm; a 3D view's lens maps it onto the longer side of the area
 _CLIP_START, _CLIP_END = 1.0, 20.0  # nearest distance drawn, mm, and farthest one, in units of the scanner's radius
 
+_DARK: dict[str, dict[str, Any]] = {
+    "shading": {"background_type": "VIEWPORT", "background_color": (0.006, 0.007, 0.009)},
+    "overlay": dict.fromkeys(
+        ("show_floor", "show_axis_x", "show_axis_y", "show_cursor", "show_relationship_lines", "show_text"), False
+    ),
+}
+"""Settings of a 3D view that show an example on a dark ground, without lines about it."""
+_VIEW = "view_location", "view_rotation", "view_distance", "view_perspective"
+
 _State = tuple[Any, ...]
 _views_by_scanner: dict[str, dict[tuple[str, int, int], tuple[_State, _State]]] = {}
 """States of the views before and after a scanner was framed, by the scanner's name and the view's indices."""
 _scanners_before_undo: set[str] = set()  # names
 
 
-def frame_scanner(collection: bpy.types.Collection, reach: float, rotation: Quaternion | None = None) -> None:
-    """Turn all 3D views, except those through a camera, to a scanner of radius `reach` mm around the isocentre."""
+def frame_scanner(
+    collection: bpy.types.Collection, reach: float, rotation: Quaternion | None = None, shown_reach: float = 0.0
+) -> None:
+    """Turn all 3D views, except those through a camera, to a scanner of radius `reach` mm around the isocentre.
+
+    Seen from a `rotation`, it stands before a dark ground; a `shown_reach`, mm, shows only so much around the isocentre.
+    """
     views = _views_by_scanner.setdefault(collection.name, {})
     for key, area, space in _spaces():
         old_state = _state(space)
@@ -32,10 +46,14 @@ def frame_scanner(collection: bpy.types.Collection, reach: float, rotation: Quat
         if view is not None and view.view_perspective != "CAMERA":
             if rotation is not None:
                 view.view_perspective, view.view_rotation = "PERSP", rotation
+                for part, values in _DARK.items():
+                    for name, value in values.items():
+                        setattr(getattr(space, part), name, value)
             left_width, right_width = _covered_widths(area) if space == area.spaces.active else (0, 0)
             width, longer = max(area.width - left_width - right_width, 1), max(area.width, area.height, 1)
-            per_pixel = 2 * reach / min(width, max(area.height, 1))
-            view.view_distance = float(np.hypot(per_pixel * longer * space.lens / _SENSOR_SIZE, reach))
+            radius = shown_reach or reach
+            per_pixel = 2 * radius / min(width, max(area.height, 1))
+            view.view_distance = float(np.hypot(per_pixel * longer * space.lens / _SENSOR_SIZE, radius))
             shift = view.view_distance * _SENSOR_SIZE / space.lens / longer * (right_width - left_width) / 2
             view.view_location = view.view_rotation @ Vector((shift, 0.0, 0.0))
         views[key] = old_state, _state(space)
@@ -56,10 +74,8 @@ def after_undo(*_: Any) -> None:
                 continue
             current, restored = _views_by_scanner[name][key][:: -1 if name in _scanners_before_undo else 1]
             if _state(space) == current:
-                space.clip_start, space.clip_end, *view_state = restored
-                if view_state:
-                    view = space.region_3d
-                    view.view_location, view.view_rotation, view.view_distance, view.view_perspective = view_state
+                for (owner, setting), value in zip(_settings(space), restored, strict=True):
+                    setattr(owner, setting, value)
 
 
 def forget(*_: Any) -> None:
@@ -82,17 +98,20 @@ def _spaces() -> Iterator[tuple[tuple[str, int, int], bpy.types.Area, bpy.types.
 
 
 def _state(space: bpy.types.SpaceView3D) -> _State:
-    """Return the clipping range of a view and, if it has one, its location, rotation, distance and perspective."""
-    view = space.region_3d
-    if view is None:
-        return space.clip_start, space.clip_end
-    view_state = tuple(view.view_location), tuple(view.view_rotation), view.view_distance, view.view_perspective
-    return space.clip_start, space.clip_end, *view_state
+    """Return the values of a view's settings that framing changes."""
+    values = [getattr(owner, name) for owner, name in _settings(space)]
+    return tuple(value if isinstance(value, str | float | int) else tuple(value) for value in values)
+
+
+def _settings(space: bpy.types.SpaceView3D) -> list[tuple[Any, str]]:
+    """Return owner and name of each setting of a view that framing changes: `_VIEW`'s only where it is drawn."""
+    owners = {"clip_start": space, "clip_end": space} | {n: getattr(space, part) for part in _DARK for n in _DARK[part]}
+    owners |= dict.fromkeys(_VIEW if space.region_3d else (), space.region_3d)
+    return [(owner, name) for name, owner in owners.items()]
 
 
 def _covered_widths(area: bpy.types.Area) -> tuple[int, int]:
     """Return the widths, pixels, that toolbar and sidebar cover at the left and the right of an area."""
-    widths = {region.alignment: region.width for region in area.regions if region.type in ("UI", "TOOLS")}
-    left_width, right_width = widths.get("LEFT", 0), widths.get("RIGHT", 0)
-    # Hidden regions are 1 pixel wide.
-    return (left_width if left_width > 1 else 0), (right_width if right_width > 1 else 0)
+    regions = [region for region in area.regions if region.type in ("UI", "TOOLS") and region.width > 1]  # 1: hidden
+    widths = {region.alignment: region.width for region in regions}
+    return widths.get("LEFT", 0), widths.get("RIGHT", 0)

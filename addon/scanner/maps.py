@@ -64,7 +64,7 @@ def map_job(
         item.mphdrr_volume.display_low, item.mphdrr_volume.display_high = low if low < high else 0.0, high
         if not slices.planes_of(item):  # the solid viewport draws a volume in one colour, but its slices in the ramp's
             slices.add_slices(item)
-        return f"{name}: {low:.4g} to {high:.4g} {unit}".removesuffix(" 1")
+        return f"{name}: {volumes.range_text(low, high, unit)}"
 
     return jobs.Job(f"{name} of {ids.counted(len(system), 'module')}", work, finish)
 

@@ -1,6 +1,5 @@
 """Edits that add, remove and renumber modules in the scene, by operators (undo steps), not by handlers."""
 
-import json
 import re
 from collections.abc import Sequence
 from typing import Literal
@@ -255,7 +254,6 @@ def renumber(collection: bpy.types.Collection, order: Literal["RINGS", "LIST"] =
         renumbered = scanner.read_scanner(collection)
         if np.any(np.diff(new_order) < 0):
             collection.mphdrr_scanner.source = ""  # the workbook's rows are in another order
-        collection.mphdrr_scanner.quick_ranges = json.dumps(scanner.quick_ranges(renumbered))
     renamings = [(data, name) for data, name in new_names if data.name != name and _OUR_NAME.fullmatch(data.name)]
     for datablock, name in renamings:
         datablock.name = f"{name} renumbered"  # frees the new names

@@ -8,14 +8,18 @@ import itertools
 import json
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict
+from operator import itemgetter
+from typing import Any
 
 import bpy
 import numpy as np
 from mathutils import Quaternion
 
 from ...core import InputError, PinholeSystem
+from ...core.arrays import ArrayLike, Integers
 from ...core.geometry.collimator import Construction
 from ...core.geometry.scanner import Finding, Scanner
+from ...core.geometry.system import chosen_indices
 from ...core.scanner_kinds import SCANNERS
 from ...core.workbook import ColumnMap, QuantityCells, SystemSource
 from ..blender import ids, objects, storage
@@ -124,7 +128,6 @@ def _write_source(properties: bpy.types.PropertyGroup, system: Scanner) -> None:
     properties.source = json.dumps(values)
     properties.workbook, properties.sha256 = values.get("path", ""), values.get("sha256", "")
     properties.n_modules = len(system)
-    properties.quick_ranges = json.dumps(quick_ranges(system))
 
 
 def default_name(system: Scanner) -> str:
@@ -133,26 +136,32 @@ def default_name(system: Scanner) -> str:
     return name if isinstance(system, PinholeSystem) else f"{name} {system.kind}"
 
 
-def quick_ranges(system: Scanner) -> list[tuple[int, int]]:
-    """Return up to three ranges (first, last) of module numbers, each of half the rings: 1-40, 21-60, 41-80 of 4 x 20."""
-    rings, numbers = system.rings(), np.asarray(system.numbers)
-    n_rings = int(rings.max()) + 1
+def numbers_text(numbers: Iterable[int], chosen: Iterable[bool]) -> str:
+    """Return the chosen ones of module numbers as text, such as "1-40, 45"."""
+    pairs = sorted(zip(numbers, chosen, strict=True))
+    runs = ([number for number, _ in run] for is_chosen, run in itertools.groupby(pairs, itemgetter(1)) if is_chosen)
+    return ", ".join("-".join(dict.fromkeys(map(str, (run[0], run[-1])))) for run in runs)
+
+
+def quick_ranges(numbers: ArrayLike, rings: Integers) -> list[str]:
+    """Return up to three texts of module numbers (M,), each of half the rings: 1-40, 21-60, 41-80 of 4 x 20."""
+    n_rings = int(rings.max(initial=0)) + 1
     width = max(1, n_rings // 2)
-    ranges = []
-    for start in sorted({0, (n_rings - width) // 2, n_rings - width}):
-        is_inside = (rings >= start) & (rings < start + width)
-        first, last = int(numbers[is_inside].min()), int(numbers[is_inside].max())
-        if np.array_equal(is_inside, (numbers >= first) & (numbers <= last)):
-            ranges.append((first, last))
-    return ranges
+    starts = sorted({0, (n_rings - width) // 2, n_rings - width})
+    return [numbers_text(np.asarray(numbers).tolist(), (rings >= s) & (rings < s + width)) for s in starts]
 
 
-def set_up_scene(scene: bpy.types.Scene, collection: bpy.types.Collection, rotation: Quaternion | None = None) -> None:
-    """Set the scene's units for a scanner, and turn the views to the whole scanner, seen from `rotation` if given."""
+def set_up_scene(
+    scene: bpy.types.Scene, collection: bpy.types.Collection, rotation: Quaternion | None = None, reach: float = 0.0
+) -> None:
+    """Set the scene's units for a scanner, and turn the views to it as `framing.frame_scanner` does.
+
+    `rotation` is the direction from which it is seen, `reach` the radius shown, mm, by default all of it.
+    """
     units = scene.unit_settings
     units.system, units.scale_length, units.length_unit = "METRIC", _MILLIMETER, "MILLIMETERS"
     reaches = [o.mphdrr_module.pinhole_distance + cameras.field_of(o.data)[2] for o in modules(collection)]
-    framing.frame_scanner(collection, max(reaches, default=_MIN_REACH), rotation)
+    framing.frame_scanner(collection, max(reaches, default=_MIN_REACH), rotation, reach)
 
 
 def is_set_up(scene: bpy.types.Scene) -> bool:
@@ -305,17 +314,43 @@ def set_visible(camera: bpy.types.Object, visible: bool) -> None:
     _set_hidden([camera, *(c for c in camera.children if c.mphdrr_module.part in collimators.PARTS)], not visible)
 
 
-def show_modules(collection: bpy.types.Collection, first: int, last: int, mode: str = "ONLY") -> int:
-    """Show modules by their numbers, first to last, and return how many are visible now.
+def _active_modules(scene: bpy.types.Scene) -> list[bpy.types.Object]:
+    """Return the modules of the active scanner, if there is one."""
+    collection = active_scanner(scene)
+    return modules(collection) if collection else []
 
-    `mode` is ``"SHOW"`` or ``"HIDE"``, which leave the other modules, ``"ONLY"``, or ``"ALL"``, which needs no range.
+
+def suggested_ranges(settings: Any, context: bpy.types.Context, text: str) -> list[str]:
+    """Return what a text field of module numbers suggests (`quick_ranges`)."""
+    values = [(o.mphdrr_module.number, o.mphdrr_module.ring) for o in _active_modules(context.scene)]
+    return quick_ranges(*np.reshape(values, (-1, 2)).astype(int).T)
+
+
+def visible_modules(settings: bpy.types.PropertyGroup) -> str:
+    """Return the numbers of the visible modules of the scene's scanner, such as "1-40, 45"; "" if all are visible."""
+    cameras_ = _active_modules(settings.id_data)
+    shown = [not camera.hide_viewport for camera in cameras_]
+    return "" if all(shown) else numbers_text([o.mphdrr_module.number for o in cameras_], shown) or "none"
+
+
+def show_visible_modules(settings: bpy.types.PropertyGroup, text: str) -> None:
+    """Show only the modules of the scene's scanner that a text lists; keep the reason in `settings` if it lists none."""
+    settings.visible_problem = ""
+    try:
+        show_modules(required_scanner(settings.id_data), text)
+    except InputError as error:
+        settings.visible_problem = str(error)
+
+
+def show_modules(collection: bpy.types.Collection, text: str = "", mode: str = "ONLY") -> int:
+    """Show the modules whose numbers a text lists, such as "1-40, 45", and return how many are visible now; "": all.
+
+    `mode` is ``"SHOW"`` or ``"HIDE"``, which leave the other modules, ``"ONLY"``, or ``"ALL"``, which needs no text.
     """
     cameras_ = modules(collection)
-    chosen = {o for o in cameras_ if mode == "ALL" or first <= o.mphdrr_module.number <= last}
-    if not chosen:
-        numbers = [o.mphdrr_module.number for o in cameras_] or [0]
-        span = f"{min(numbers)} to {max(numbers)}"
-        raise InputError(f"no module between {first} and {last}: '{collection.name}' has {span}")
+    numbers = np.array([camera.mphdrr_module.number for camera in cameras_] or [0])
+    wanted = numbers[chosen_indices(numbers, text if text and mode != "ALL" else "-", "modules")]
+    chosen = {camera for camera in cameras_ if camera.mphdrr_module.number in wanted}
     for camera, parts in following.parts_of(collection, cameras_).items():
         if camera in chosen or mode == "ONLY":
             _set_hidden([camera, *parts], mode == "HIDE" or camera not in chosen)

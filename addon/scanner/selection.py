@@ -4,7 +4,7 @@ from collections.abc import Iterable
 
 import bpy
 
-from ..blender import reports, windows
+from ..blender import objects, reports, windows
 from . import following, scanner
 
 SCANNER: reports.Need = (
@@ -65,6 +65,7 @@ def after_update(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None
     """Make the panels' scanner, the list and the mosaic follow when another object becomes active in the viewport."""
     if not depsgraph.id_type_updated("SCENE") or scene != bpy.context.scene:
         return
+    _show_panels(scene)
     item = bpy.context.view_layer.objects.active
     camera = module_of(item)
     collection = scanner.scanner_of(scene, camera or item)
@@ -74,17 +75,26 @@ def after_update(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None
         with following.writing():
             if scene.mphdrr_geometry.scanner != collection:  # writing makes Blender search all objects
                 scene.mphdrr_geometry.scanner = collection
-            _activate_in_list(scene, camera or next(iter(scanner.modules(collection)), None))
+            activate_in_list(scene, camera or next(iter(scanner.modules(collection)), None))
         windows.redraw("IMAGE_EDITOR")  # the mosaic has a frame around the active module's image
+
+
+def _show_panels(scene: bpy.types.Scene) -> None:
+    """Show of all X-ray panels only the active source's: together they would hide everything."""
+    active = active_module(bpy.context)
+    for collection in scanner.scanners(scene):
+        for item in () if scanner.sees_activity(collection) else list(collection.all_objects):  # hiding changes these
+            if item.mphdrr_module.part == "PANEL" and item.parent is not None:
+                objects.change(item, hide_viewport=item.parent.hide_viewport or item.parent != active)
 
 
 def scanner_chosen(scene: bpy.types.Scene) -> None:
     """Make the first module of a scanner active that was chosen in the panel."""
     if (collection := scanner.active_scanner(scene)) is not None and not following.is_writing():
-        _activate_in_list(scene, next(iter(scanner.modules(collection)), None))
+        activate_in_list(scene, next(iter(scanner.modules(collection)), None))
 
 
-def _activate_in_list(scene: bpy.types.Scene, camera: bpy.types.Object | None) -> None:
+def activate_in_list(scene: bpy.types.Scene, camera: bpy.types.Object | None) -> None:
     """Make a module active in the panel's list."""
     collection = scanner.active_scanner(scene)
     if camera is not None and collection is not None:

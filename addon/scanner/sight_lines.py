@@ -19,7 +19,7 @@ _LINES = {
     "show_frustums": ((0.45, 0.8, 1.0, 0.35), [(0, 1), (0, 2), (0, 3), (0, 4)]),
     "show_detectors": ((0.45, 0.8, 1.0, 0.9), [(1, 2), (2, 3), (3, 4), (4, 1)]),
 }
-_TINT, _ENLARGED = (1.0, 0.55, 0.1, 0.55), 1.004  # colour of the active module's parts, and how much larger it is drawn
+_TINT, _ENLARGED = (1.0, 0.55, 0.1, 0.3), 1.004  # colour of the active module's parts, and how much larger it is drawn
 _WIDTH = 1.5  # of the lines, pixels
 _CORNERS = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)])
 
@@ -76,7 +76,9 @@ def draw() -> None:
     if len(faces := active_faces(context)):
         shader = gpu.shader.from_builtin("UNIFORM_COLOR")
         shader.uniform_float("color", _TINT)
+        gpu.state.face_culling_set("BACK")  # else parts that are seen through would be tinted twice
         batch_for_shader(shader, "TRIS", {"pos": faces.reshape(-1, 3).astype(np.float32)}).draw(shader)
+        gpu.state.face_culling_set("NONE")
     for name, ends in lines(context).items():
         windows.draw_lines(ends.reshape(-1, 3).astype(np.float32), _LINES[name][0], _WIDTH)
     gpu.state.depth_test_set("NONE")

@@ -57,7 +57,7 @@ def voxelize_job(
         total = f"{content * 1e-3:.4g} kBq" if quantity == "activity" else f"{content:.4g} {UNITS[quantity]} mm^3"
         return f"Added {name!r}: {shape} voxels of {grid.spacing[0]:.3g} mm, {total} in all"
 
-    return volumes.add_volume_job("Voxelizing meshes", make, name, finish, provenance=provenance)
+    return volumes.add_volume_job("Voxelizing meshes", make, name, finish, provenance=provenance, sources=items)
 
 
 def mesh_job(item: bpy.types.Object, level: float | None = None) -> jobs.Job:

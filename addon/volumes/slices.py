@@ -25,7 +25,10 @@ _LATTICE = "mphdrr_slice_of"  # custom property: shape and affine of the grid th
 _MATERIAL = "mphdrr_material"  # custom property: a plane's own material, with its picture
 _GROUP = "mphDRR Slice"  # the node group that draws all slices
 _SHADES = 256
-_FRONT = (0.7, -0.5, 0.5)  # direction towards the viewer of a new scene: the volume is cut open on that side
+# Share of the display range below which activity is transparent on slices; from twice that on it is opaque.
+_CLEAR = 0.2
+_FRAME = 0.01, (0.75, 0.8, 0.88)  # width of a slice's frame, relative to its sides, and its linear RGB
+FRONT = (0.7, -0.5, 0.5)  # direction towards the viewer of a new scene: the volume is cut open on that side
 
 # The volume of which slices were drawn last, with its file: reading it takes longer than everything else.
 _last_volume: tuple[Path, Volume] | None = None
@@ -57,12 +60,10 @@ def add_slices(item: bpy.types.Object, indices: Sequence[int] | None = None) -> 
 def remove_slices(item: bpy.types.Object) -> None:
     """Remove a volume's planes, with their meshes, materials and images, and close the cut."""
     for plane in planes_of(item):
-        materials = list(plane.data.materials)
-        trees = [material.node_tree for material in materials if material and material.node_tree]
-        pictures = [tree.nodes["Slice"].image for tree in trees if "Slice" in tree.nodes]
+        materials, picture = list(plane.data.materials), _image(plane)
         objects.remove_objects([plane])
         objects.remove_unused(materials)
-        objects.remove_unused([*pictures, bpy.data.node_groups.get(_GROUP)])
+        objects.remove_unused([picture, bpy.data.node_groups.get(_GROUP)])
     looks.apply_look(item, None)
 
 
@@ -83,7 +84,7 @@ def slice_track(item: bpy.types.Object, axis: int) -> tuple[Vector, Vector]:
     """Return a front corner of the first plane across a grid axis, and the step to the next plane; in world mm."""
     shape, affine = json.loads(planes_of(item)[0][_LATTICE])  # of any plane: the user may have deleted others
     world = np.array(item.matrix_world) @ affine
-    corner = np.where(np.linalg.inv(world)[:3, :3] @ _FRONT >= 0, np.array(shape) - 0.5, -0.5)
+    corner = np.where(np.linalg.inv(world)[:3, :3] @ FRONT >= 0, np.array(shape) - 0.5, -0.5)
     corner[axis] = 0.0
     return Vector((world @ [*corner, 1.0])[:3]), Vector(world[:3, axis])
 
@@ -105,7 +106,7 @@ def plane_names(item: bpy.types.Object) -> list[str]:
 def look_changed(item: bpy.types.Object) -> None:
     """Draw a volume in a newly chosen look."""
     looks.apply_presets(item)
-    if item.mphdrr_volume.look == "CUT" and not planes_of(item):
+    if item.mphdrr_volume.look in ("CUT", "BONE") and not planes_of(item):
         try:
             add_slices(item)
         except InputError as error:
@@ -127,7 +128,7 @@ def update(item: bpy.types.Object) -> None:
         add_slices(item)
         return
     normals = np.linalg.inv(volume.grid.affine)  # grid indices from the object's space, mm
-    front = np.array(_FRONT) @ volumes.pose_of_object(item)[:3, :3]
+    front = np.array(FRONT) @ volumes.pose_of_object(item)[:3, :3]
     cut = []
     for plane in planes:
         axis = plane[_KEY]
@@ -185,7 +186,7 @@ def before_save(*_: object) -> None:
 
 
 def after_update(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None:
-    """Update the planes where a look has changed, and hide or show them with their volumes."""
+    """Update the planes where a look has changed, and hide or show them and surfaces with their volumes."""
     if scene != bpy.context.scene:
         return
     if depsgraph.id_type_updated("MATERIAL") or depsgraph.id_type_updated("NODETREE"):  # a look was replaced or edited
@@ -196,8 +197,8 @@ def after_update(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None
     if not depsgraph.id_type_updated("SCENE"):
         return
     for item in volumes.volume_objects(scene):
-        for plane in planes_of(item):
-            objects.change(plane, hide_viewport=not item.visible_get())
+        for part in (*planes_of(item), *looks.surfaces_of(item)):
+            objects.change(part, hide_viewport=not item.visible_get())
 
 
 def after_frame_change(scene: bpy.types.Scene, *_: object) -> None:
@@ -240,15 +241,18 @@ def _plane(item: bpy.types.Object, volume: Volume, axis: int, name: str) -> bpy.
     """Return a new plane of a volume, perpendicular to a grid axis, at index 0."""
     name = f"{item.name} {name}"
     column, row = (a for a in range(3) if a != axis)
-    corners = np.zeros((4, 4))
+    uv = np.array([(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0)])
+    uv = np.concatenate([uv, (1 + 2 * _FRAME[0]) * uv - _FRAME[0]])
+    corners = np.zeros((8, 4))
     corners[:, 3] = 1.0
-    uv = ((0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0))
-    corners[:, [column, row]] = np.array(uv) * [volume.grid.shape[column], volume.grid.shape[row]] - 0.5
-    mesh = bpy.data.meshes.new(name)
-    mesh.from_pydata((corners @ volume.grid.affine.T)[:, :3].tolist(), [], [(0, 1, 2, 3)])
-    mesh.uv_layers.new(name="Slice").data.foreach_set("uv", np.array(uv, np.float32).ravel())
+    corners[:, [column, row]] = uv * [volume.grid.shape[column], volume.grid.shape[row]] - 0.5
+    mesh, faces = bpy.data.meshes.new(name), [(0, 1, 2, 3), (0, 1, 5, 4), (1, 2, 6, 5), (2, 3, 7, 6), (3, 0, 4, 7)]
+    mesh.from_pydata((corners @ volume.grid.affine.T)[:, :3].tolist(), [], faces)
+    mesh.uv_layers.new(name="Slice").data.foreach_set("uv", uv[np.ravel(faces)].astype(np.float32).ravel())
+    mesh.polygons.foreach_set("material_index", [0, 1, 1, 1, 1])
     image = bpy.data.images.new(name, volume.grid.shape[column], volume.grid.shape[row], alpha=True)
     mesh.materials.append(_material(name, image))
+    mesh.materials.append(looks.new_material(name + " frame", (), _FRAME[1]))
     plane = bpy.data.objects.new(name, mesh)
     plane[_KEY], plane[_LATTICE], plane[_MATERIAL] = axis, _grid_key(volume), mesh.materials[0]
     plane.parent = item
@@ -290,10 +294,12 @@ def _node_group() -> bpy.types.NodeTree:
 def color_table(quantity: str, ramp: volume_materials.Ramp | None = None) -> NDArray[np.float32]:
     """Return the colours (256, 4) of the display range, RGBA as an sRGB image holds them; the lowest is transparent.
 
-    The colours are interpolated from `ramp`, by default from the quantity's.
+    Dim activity is transparent, too, so that slices do not hide what is behind them. The colours are interpolated from
+    `ramp`, by default from the quantity's.
     """
     positions, ramp_colors = zip(*(ramp or volume_materials.ramp(quantity)), strict=True)
     shades = np.linspace(0, 1, _SHADES)
     rgb = np.stack([np.interp(shades, positions, channel) for channel in np.transpose(ramp_colors)], axis=1)
     srgb = np.where(rgb <= 0.0031308, 12.92 * rgb, 1.055 * rgb ** (1 / 2.4) - 0.055)
-    return np.column_stack([srgb, np.arange(_SHADES) > 0]).astype(np.float32)
+    opacity = np.clip((shades - _CLEAR) / _CLEAR, 0, 1) if quantity == "activity" else shades > 0
+    return np.column_stack([srgb, opacity]).astype(np.float32)

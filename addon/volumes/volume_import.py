@@ -129,7 +129,7 @@ def _derived_volume_job(
     count = len(readers)
     n_x, n_y, n_z = item.mphdrr_volume.shape
     memory.require(8.0 * count * n_x * n_y * n_z, f"the {label} of {count * n_x * n_y * n_z} voxels")
-    frame_start, sequence_mode = item.data.frame_start, item.data.sequence_mode
+    frame_start, sequence_mode, look = item.data.frame_start, item.data.sequence_mode, item.mphdrr_volume.look
 
     def make(progress: Progress) -> list[Volume]:
         """Return the volume that `derive` makes of each state."""
@@ -142,7 +142,9 @@ def _derived_volume_job(
     def finish(result: bpy.types.Object, stored: stored_volumes.StoredVolume) -> str:
         """Make the new volume play its states as the old one does, and return the line to report."""
         result.data.frame_start, result.data.sequence_mode = frame_start, sequence_mode
+        if stored.volume.quantity == "mu":
+            result.mphdrr_volume.look = look
         return f"Added {result.name!r}: {volumes.values_text(stored)}{note}"
 
-    pose, collection = volumes.pose_of_object(item), item.users_collection[0]
-    return volumes.add_volume_job(f"Making {label}", make, f"{item.name} {label}", finish, pose, provenance, collection)
+    name, pose, collection = f"{item.name} {label}", volumes.pose_of_object(item), item.users_collection[0]
+    return volumes.add_volume_job(f"Making {label}", make, name, finish, pose, provenance, collection, [item])

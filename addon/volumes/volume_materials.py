@@ -1,8 +1,8 @@
 """Appearance of volumes: colours, display units, volume materials, and the density of the solid viewport's smoke.
 
-Activity glows in purples, maps are green; attenuation and CT numbers look like a radiograph on slices and like tissue as
-smoke, brighter for higher values. Neither activity nor maps have a hue of the crystals (`core.geometry.part_colors`) or of
-Blender's selection.
+Activity has the mosaic's colours, maps are green; attenuation and CT numbers look like a radiograph on slices and like
+tissue as smoke, brighter for higher values. Maps have no hue of the crystals (`core.geometry.part_colors`) or of Blender's
+selection.
 """
 
 from collections.abc import Sequence
@@ -13,6 +13,7 @@ import bpy
 import numpy as np
 
 from ...core.files import ensure_folder
+from ...core.runs.display import Display
 from ...core.volumes.volume import UNITS
 from ..blender import objects
 from ..blender.compat import add_math, add_node, blank_material
@@ -20,14 +21,9 @@ from ..blender.compat import add_math, add_node, blank_material
 Ramp = tuple[tuple[float, tuple[float, ...]], ...]
 """Positions (0 to 1) and linear RGB colours."""
 
-# Colours of evenly increasing brightness.
-_PURPLES = (
-    (0.00, (0.0060, 0.0020, 0.0180)),
-    (0.25, (0.0500, 0.0090, 0.1750)),
-    (0.50, (0.2700, 0.0180, 0.3000)),
-    (0.75, (0.7800, 0.0700, 0.3600)),
-    (1.00, (0.9500, 0.4800, 0.6800)),
-)
+_SRGB = Display("inferno").colored(np.arange(17), (0, 16)) / 255  # the mosaic's default
+_LINEAR = np.where(_SRGB <= 0.04045, _SRGB / 12.92, ((_SRGB + 0.055) / 1.055) ** 2.4)
+_INFERNO: Ramp = tuple((step / 16, tuple(rgb)) for step, rgb in enumerate(_LINEAR.tolist()))
 _GREENS = (
     (0.00, (0.0020, 0.0100, 0.0160)),
     (0.25, (0.0110, 0.0800, 0.1200)),
@@ -61,7 +57,7 @@ _INPUTS = {
 # Materials of versions without looks have these inputs in other nodes: the node's name and the input's index.
 _LEGACY = {"Low": ("Display Range", 1), "High": ("Display Range", 2), "Exponent": ("Exponent", 1), "Gain": ("Gain", 1)}
 _LOOKS: dict[str, Ramp] = {
-    "mphDRR Purples": _PURPLES, "mphDRR Greens": _GREENS, "mphDRR Greys": _GREYS,
+    "mphDRR Inferno": _INFERNO, "mphDRR Greens": _GREENS, "mphDRR Greys": _GREYS,
     "mphDRR Tissues": _TISSUES, "mphDRR Fire": _FIRE, "mphDRR Ice": _ICE,
 }  # fmt: skip
 _ICON = 128  # pixels
@@ -77,7 +73,7 @@ def ramp(quantity: str, smoke: bool = False) -> Ramp:
     """Return the positions (0 to 1) and colours (linear RGB) of a quantity's display range, on slices or as smoke."""
     if quantity in XRAY:
         return _TISSUES if smoke else _GREYS
-    return _PURPLES if quantity == "activity" else _GREENS
+    return _INFERNO if quantity == "activity" else _GREENS
 
 
 def display_unit(quantity: str) -> tuple[str, float]:

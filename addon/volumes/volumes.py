@@ -18,6 +18,7 @@ from ...core import InputError, Volume, memory
 from ...core.errors import warn
 from ...core.geometry.frames import checked_affine
 from ...core.progress import Progress, stages_of
+from ...core.runs.display import number_text
 from ..blender import compat, ids, jobs, objects, reports, storage
 from . import vdb, volume_materials
 from .stored_volumes import StoredVolume, move_grid, store_volume, write_states
@@ -51,6 +52,8 @@ def add_stored(stored: StoredVolume, name: str, collection: bpy.types.Collection
     item = bpy.data.objects.new(name, _volume_data(stored, name))
     (collection or bpy.context.scene.collection).objects.link(item)
     _set_properties(item, stored)
+    if stored.volume.quantity == "hu":
+        item.mphdrr_volume.look = "BONE"
     return item
 
 
@@ -69,12 +72,15 @@ def add_volume_job(
     pose: ArrayLike | None = None,
     provenance: dict[str, Any] | None = None,
     collection: bpy.types.Collection | None = None,
+    sources: Sequence[bpy.types.Object] = (),
 ) -> jobs.Job:
     """Return the job that makes a volume, or its states, in a worker thread, adds it to the scene, and selects it alone.
 
     ``make(progress)`` returns the volume and may add to the `provenance`. `finish` sets the rest of the new object and
-    returns the line to report. The other arguments are those of `add_volume`.
+    returns the line to report. The `sources`, objects that the volume is made from, are hidden then. The other arguments
+    are those of `add_volume`.
     """
+    source_uids = [source.session_uid for source in sources]
     folder, collection_uid = storage.folder(), 0 if collection is None else collection.session_uid
 
     def work(progress: Progress) -> StoredVolume:
@@ -86,6 +92,7 @@ def add_volume_job(
     def finished(stored: StoredVolume) -> str:
         """Add the volume to the scene, make it active, and return the line of `finish`."""
         item = add_stored(stored, name, jobs.find_by_uid(bpy.data.collections, collection_uid))
+        objects.hide(*(jobs.find_by_uid(bpy.data.objects, uid) for uid in source_uids))
         make_active(bpy.context, item)
         return finish(item, stored)
 
@@ -95,7 +102,12 @@ def add_volume_job(
 def values_text(stored: StoredVolume) -> str:
     """Return the range of a volume's values as the window shows it, with the unit: "0 to 100 kBq/mL"."""
     unit, factor = volume_materials.display_unit(stored.volume.quantity)
-    return f"{factor * stored.low:.4g} to {factor * stored.high:.4g} {unit}".removesuffix(" 1")
+    return range_text(factor * stored.low, factor * stored.high, unit)
+
+
+def range_text(low: float, high: float, unit: str) -> str:
+    """Return a range of values with its unit as a text, which has no unit of 1."""
+    return f"{number_text(low)} to {number_text(high)} {unit}".removesuffix(" 1")
 
 
 def replace_stored(item: bpy.types.Object, stored: StoredVolume) -> None:
@@ -322,13 +334,12 @@ def _frame_number(data: bpy.types.Volume) -> int | None:
 def _set_properties(item: bpy.types.Object, stored: StoredVolume) -> None:
     """Set the pose and the `VolumeProperties` of a Volume object from a stored volume.
 
-    A display range that the user has changed stays; the surface's value stays at its fraction of the display range.
+    A display range that the user has changed stays.
     """
     volume = stored.volume
     item.matrix_world = Matrix(stored.pose)
     settings = item.mphdrr_volume
-    low, high = display_range = settings.display_low, settings.display_high
-    surface_share = (settings.surface - low) / ((high - low) or 1.0)  # share of the display range
+    display_range = settings.display_low, settings.display_high
     usual_range = volume_materials.default_range(settings.quantity, settings.minimum, settings.maximum)
     unit, factor = volume_materials.display_unit(volume.quantity)
     is_same_kind = settings.is_volume and settings.quantity == volume.quantity
@@ -341,6 +352,12 @@ def _set_properties(item: bpy.types.Object, stored: StoredVolume) -> None:
     settings.center_shift = compat.VDB_CENTER_SHIFT
     if not is_typed:
         display_range = volume_materials.default_range(volume.quantity, factor * stored.low, factor * stored.high)
-    if display_range != (low, high):
-        settings.surface = display_range[0] + surface_share * (display_range[1] - display_range[0])
-    settings.display_low, settings.display_high = display_range
+    set_display_range(item, *display_range)
+
+
+def set_display_range(item: bpy.types.Object, low: float, high: float) -> None:
+    """Set the display range of a volume; the surface's value stays at its share of the range."""
+    settings = item.mphdrr_volume
+    share = (settings.surface - settings.display_low) / ((settings.display_high - settings.display_low) or 1.0)
+    settings.surface = low + share * (high - low)
+    settings.display_low, settings.display_high = low, high

@@ -9,9 +9,9 @@ import numpy as np
 from ..arrays import Bytes, Floats, Floats32, Integers
 from ..errors import InputError
 from ..figures.page import LARGEST, Page, box
-from ..figures.parts import number
 from ..runs import letters
 from ..runs.display import Display, resize_picture, unit_text
+from ..runs.display import number_text as number
 from ..runs.mosaic import COLUMNS, as_seen, tile_places
 from ..volumes.volume import Volume
 from .event_set import Event

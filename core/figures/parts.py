@@ -8,6 +8,7 @@ from numpy.typing import ArrayLike
 
 from ..runs import letters
 from ..runs.display import Display, unit_text
+from ..runs.display import number_text as number
 from .page import Page, Point, box
 
 INK, FAINT = "#20262d", "#6b7480"
@@ -100,11 +101,6 @@ def arrange(
             x += sizes[i][0] * best_scale + margin_x
         y += row_height
     return best_scale, [corners[i] for i in range(len(sizes))]
-
-
-def number(value: float, digits: int = 4) -> str:
-    """Return a number as text with `digits` digits and a proper minus sign."""
-    return f"{value + 0.0:.{digits}g}".replace("-", "−")  # -0 is 0
 
 
 def color_bar(

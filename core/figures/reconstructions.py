@@ -9,11 +9,12 @@ import numpy as np
 from ..arrays import ArrayLike, Floats32
 from ..runs import letters
 from ..runs.display import DARK_DIVERGING, Display, ticks
+from ..runs.display import number_text as number
 from ..volumes.resampling import resample
 from ..volumes.sights import bright_value, full_slices
 from ..volumes.volume import Volume
 from .page import Page, circle
-from .parts import PLANES, Axes, arrange, bar_width, color_bar, number
+from .parts import PLANES, Axes, arrange, bar_width, color_bar
 
 SIZE, SIZE_BESIDE_TRUTH = (1600, 500), (1600, 850)
 """Default width and height, pixels, of the picture of a reconstruction alone, and beside the truth."""
@@ -36,12 +37,13 @@ def draw(
     lines: Sequence[str] = (),
     objective_name: str = "log-likelihood",
     rods: Sequence[tuple[str, str, str, str]] = (),
-) -> None:
+) -> tuple[float, float]:
     """Draw slices of a volume, beside those of `truth` and of the error, and write its scores and objective.
 
     As many slices as are legible are drawn, the most varied plane first, each through a well-filled part of the truth, or
     else of the volume. The truth is drawn on the reconstruction's voxels, as the mean over each. The axes of the slices are
     the world's. `rods` are the `cells` of a Derenzo score's sectors; `lines` are texts, the first one below the title.
+    Returns the values of the slices' first and last colours.
     """
     em, grid, rows = page.em, volume.grid, _rows(volume, truth)
     values = rows[0].values
@@ -78,6 +80,7 @@ def draw(
         color_bar(page, row.display, row.window, row.unit, round(x), round(y), max(2, round(height * scale)))
         x += step
     _draw_texts(page, left, title, lines, rods, objective, objective_name)
+    return rows[0].window
 
 
 class _Row(NamedTuple):

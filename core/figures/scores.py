@@ -11,11 +11,12 @@ from ..reconstruction.scores.derenzo import DerenzoSector
 from ..reconstruction.scores.summary import VolumeScore
 from ..runs import letters
 from ..runs.display import Display, ticks
+from ..runs.display import number_text as number
 from ..volumes.resampling import values_at
 from ..volumes.sights import full_slices
 from ..volumes.volume import Volume
 from .page import Page
-from .parts import FAINT, INK, Axes, bar_width, color_bar, heading, number
+from .parts import FAINT, INK, Axes, bar_width, color_bar, heading
 
 SIZE = (1800, 950)
 """Default width and height, pixels, of the page."""

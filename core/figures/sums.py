@@ -4,9 +4,10 @@ import numpy as np
 
 from ..arrays import Bytes, Floats, Floats32
 from ..runs.display import Display, ticks
+from ..runs.display import number_text as number
 from ..volumes.volume import LINE_INTEGRALS, Volume, require_quantity
 from .page import Page
-from .parts import INK, PLANES, Axes, arrange, bar_width, color_bar, heading, number
+from .parts import INK, PLANES, Axes, arrange, bar_width, color_bar, heading
 from .subject import FigureSubject
 
 _ROWS_OF_PANELS = (((0, 1, 2),), ((0,), (1, 2)), ((0,), (1,), (2,)))  # possible arrangements

@@ -15,8 +15,9 @@ from ..geometry.presets import c_arm_views
 from ..geometry.system import PinholeSystem
 from ..geometry.views import Views
 from ..runs import letters
+from ..runs.display import number_text as number
 from .page import Anchor, Page, Point, box, circle
-from .parts import FAINT, INK, arrange, heading, number
+from .parts import FAINT, INK, arrange, heading
 from .subject import FigureSubject
 
 _CRYSTAL, _METAL, _ROI, _FAN = "#f0a030", "#8a929c", "#4f9bd6", "#d0502a"

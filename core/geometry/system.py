@@ -242,19 +242,22 @@ def chosen_modules(system: AnyScanner, text: str | None, name: str = "--modules"
 
     `name` is what messages call the text.
     """
-    if text is None:
-        return system
+    return system if text is None else system[chosen_indices(system.numbers, text, name)]
+
+
+def chosen_indices(numbers: Integers, text: str, name: str) -> Integers:
+    """Return the indices of those module `numbers` (M,) that `text` lists; arguments are those of `chosen_modules`."""
     chosen: list[Integers] = []
-    lowest, highest = int(system.numbers.min()), int(system.numbers.max())
+    lowest, highest = int(numbers.min()), int(numbers.max())
     for part in text.split(","):
         first, dash, last = part.strip().partition("-")
         with expecting(f"{name} {text!r}: expected numbers such as 1-40 or 1-20,41"):
             low = int(first) if first or not dash else lowest
             high = int(last) if last else highest if dash else low
-        indices = np.flatnonzero((system.numbers >= low) & (system.numbers <= high))
+        indices = np.flatnonzero((numbers >= low) & (numbers <= high))
         if high < low:
             raise InputError(f"{name} {text!r}: {part.strip()} ends before it begins")
         if len(indices) == 0:
             raise InputError(f"{name} {text!r}: no module {part.strip()}; there are {lowest} to {highest}")
         chosen.append(indices)
-    return system[np.unique(np.concatenate(chosen))]
+    return np.unique(np.concatenate(chosen))

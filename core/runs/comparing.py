@@ -6,7 +6,7 @@ import numpy as np
 
 from ..arrays import Floats32
 from ..errors import InputError
-from .display import DIVERGING, Display
+from .display import DIVERGING, Display, unit_text
 from .mosaic import MosaicSheet, draw_sheet
 from .run import ProjectionRun
 
@@ -29,7 +29,8 @@ class Difference:
     @property
     def text(self) -> str:
         """Maximum, RMS and relative difference in one line."""
-        return f"maximum {self.maximum:.4g}, rms {self.rms:.4g} {self.unit}, relative {self.relative:.3%}"
+        rms = f"rms {self.rms:.4g} {unit_text(self.unit)}".strip()
+        return f"maximum {self.maximum:.4g}, {rms}, relative {self.relative:.3%}"
 
 
 def difference(run: ProjectionRun, other: ProjectionRun) -> Difference:

@@ -1,5 +1,6 @@
 """Numbers as colours: window, scale and colour map of a picture, and pictures in another size."""
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -26,7 +27,16 @@ COLORS = tuple(name for name in _COLORS if name not in (DIVERGING, DARK_DIVERGIN
 """Names of the colour maps; all but grey are perceptually uniform."""
 _STEPS = (1.0, 2.0, 2.5, 5.0, 10.0)
 """Steps between round numbers."""
+SUPERSCRIPTS = str.maketrans("0123456789-", "⁰¹²³⁴⁵⁶⁷⁸⁹⁻")
+_PLAIN_DIGITS = 5
+"""Digits before the decimal point up to which a number is written without a power of ten."""
 SCALES = ("linear", "sqrt", "log")
+PARTS = ("object", "half", "whole")
+"""Parts of images that can be shown, see `Display.shown`."""
+_FAINT = 0.02
+"""Sum of a row or column, relative to the largest of all images, up to which it does not count as the object's."""
+_MARGIN = 0.03
+"""Margin around the object, in halves of an image's side."""
 _DECADES = 3.0
 """Decades that an automatic logarithmic window spans."""
 
@@ -46,13 +56,15 @@ class Display:
     """Number with the first colour; None for an automatic one."""
     high: float | None = None
     """Number with the last colour; None for the largest number."""
-    half: bool = False
-    """Whether only the middle half of each image is shown, which users call the FOV; the whole image is the wide FOV."""
+    shown: str = "whole"
+    """Part of each image around its middle, a name of `PARTS`: the "whole" image, which users call the wide FOV; its middle
+    "half", the FOV; or, in a mosaic, as many eighths of both sides as hold the "object" in all images, with a margin."""
 
     def __post_init__(self) -> None:
         if self.colors not in _COLORS:
             raise InputError(f"colors {self.colors!r}: expected one of {', '.join(COLORS)}")
         one_of(self.scale, SCALES, "scale")
+        one_of(self.shown, PARTS, "shown")
         for name, value in (("low", self.low), ("high", self.high)):
             if value is not None and not np.isfinite(value):
                 raise InputError(f"{name} = {value}: expected a finite number")
@@ -61,10 +73,12 @@ class Display:
         if self.scale == "log" and self.low is not None and self.low <= 0:
             raise InputError(f"low = {self.low:g}: expected more than 0 on the logarithmic scale")
 
-    def part(self, images: Floats32) -> Floats32:
-        """Return the part of images (..., n_v, n_u) that is shown."""
-        n_v, n_u = images.shape[-2:]
-        return images[..., n_v // 4 : n_v - n_v // 4, n_u // 4 : n_u - n_u // 4] if self.half else images
+    def part(self, images: Floats32, in_mosaic: bool = False) -> Floats32:
+        """Return the part of images (..., n_v, n_u) that is shown, the same of all images."""
+        fits = in_mosaic and self.shown == "object"
+        eighths = 4 if self.shown == "half" else _eighths_of_object(images) if fits else 8
+        top, left = (n * (8 - eighths) // 16 for n in images.shape[-2:])
+        return images[..., top : images.shape[-2] - top, left : images.shape[-1] - left]
 
     def window(self, values: ArrayLike) -> tuple[float, float]:
         """Return the numbers with the first and the last colour if `values` are shown."""
@@ -116,6 +130,16 @@ class Display:
         return _table(self.colors)[np.rint(shares * 255).astype(np.uint8)]
 
 
+def _eighths_of_object(images: Floats32) -> int:
+    """Return how many eighths of both sides, around the middle, hold the object in all images (..., n_v, n_u)."""
+    extent = 0.0
+    for axis in (-2, -1):
+        sums = np.abs(np.nan_to_num(images)).sum(axis=axis)
+        lines = np.nonzero(sums > _FAINT * sums.max(initial=0.0))[-1]
+        extent = max(extent, float(np.abs(2 * lines + 1 - sums.shape[-1]).max(initial=-1) + 1) / sums.shape[-1])
+    return min(8, math.ceil(8 * (extent + _MARGIN))) if extent else 8
+
+
 def _table(colors: str) -> Bytes:
     """Return the 256 colours (256, 3), 8-bit sRGB, of a map."""
     anchors = np.array([list(bytes.fromhex(text)) for text in _COLORS[colors].split()], float)
@@ -131,6 +155,18 @@ def ticks(low: float, high: float, max_steps: int) -> list[float]:
     step = power * next(s for s in _STEPS if s * power >= smallest_step * (1 - 1e-9))
     first = np.ceil(low / step - 1e-9)
     return [float(step * n) + 0.0 for n in np.arange(first, np.floor(high / step + 1e-9) + 1)]  # -0 is 0
+
+
+def number_text(value: float, digits: int = 4) -> str:
+    """Return a number as people write it, with `digits` digits: "0.25", "−3", "16380", "10⁵", "3.349 × 10¹¹"."""
+    text = f"{value + 0.0:.{digits}g}"  # -0 is 0
+    mantissa, _, exponent = text.partition("e")
+    if exponent and 0 < int(exponent) < _PLAIN_DIGITS:
+        text = f"{float(text):.0f}"
+    elif exponent:
+        power = "10" + str(int(exponent)).translate(SUPERSCRIPTS)
+        text = mantissa[:-1] + power if mantissa in ("1", "-1") else f"{mantissa} × {power}"
+    return text.replace("-", "−")
 
 
 def unit_text(unit: str) -> str:

@@ -2,6 +2,7 @@
 
 import base64
 import functools
+import re
 import zlib
 from collections.abc import Callable
 from pathlib import Path
@@ -9,11 +10,13 @@ from pathlib import Path
 import numpy as np
 
 from ..arrays import Floats32
-from .display import resize_picture
+from .display import SUPERSCRIPTS, resize_picture
 
 _CHARACTERS = "".join(map(chr, range(32, 127))) + "µ²³·×°±−–αβθφψΣ∫"
 _EM, _ROWS, _BASELINE = 48, 51, 39
 """Pixels per em of the stored letters, their height, and the row of their baseline."""
+_RAISED = 0.68
+"""Size of a superscript relative to the letters."""
 # DejaVu Sans, whose licence allows any use: a byte for the width of each character, then one bit per pixel, column by
 # column, which is 1 where ink begins or ends along a row.
 _BITS = Path(__file__).with_name("letters.txt")
@@ -38,9 +41,9 @@ def width(text: str, size: float) -> float:
 
 
 def wrap_text(text: str, fits: Callable[[str], bool]) -> list[str]:
-    """Return a text as lines for which `fits` returns True, broken at spaces."""
+    """Return a text as lines for which `fits` returns True, broken at spaces, but not before a unit of length."""
     lines = [""]
-    for word in text.split():
+    for word in re.split(r"\s+(?!mm\b)", text.strip()):
         longer = f"{lines[-1]} {word}".strip()
         if lines[-1] and not fits(longer):
             lines.append(word)
@@ -56,4 +59,8 @@ def _letters() -> dict[str, Floats32]:
     widths, bits = stored[: len(_CHARACTERS)].astype(int), np.unpackbits(stored[len(_CHARACTERS) :])
     flips = bits[: widths.sum() * _ROWS].reshape(-1, _ROWS)
     ink = np.bitwise_xor.accumulate(flips, axis=0).T.astype(np.float32)
-    return dict(zip(_CHARACTERS, np.split(ink, np.cumsum(widths)[:-1], axis=1), strict=True))
+    letters = dict(zip(_CHARACTERS, np.split(ink, np.cumsum(widths)[:-1], axis=1), strict=True))
+    for plain, raised in SUPERSCRIPTS.items():
+        small = resize_picture(letters[chr(plain)][..., None], *(round(_RAISED * n) for n in letters[chr(plain)].shape))
+        letters[chr(raised)] = np.pad(small[..., 0], ((0, _ROWS - len(small)), (0, 0)))
+    return letters

@@ -16,7 +16,7 @@ from ..errors import InputError
 from ..files import AnyPath, write_bytes
 from ..validation import real_numbers
 from . import letters
-from .display import Display, unit_text
+from .display import Display, number_text, unit_text
 
 if TYPE_CHECKING:  # pages of figures read this file, and runs take a while
     from .run import ProjectionRun
@@ -33,9 +33,11 @@ def as_seen(images: ArrayLike) -> Array:
 
 COLUMNS = 20
 """Default number of images in a row."""
+_PAGE, _NARROWEST, _WIDEST = 1.5, 1.0, 2.5
+"""Columns of a sheet of one ring over its rows."""
 _BORDER = 64
 """Grey between the images of a sheet, 0 to 255."""
-_SMALLEST = 64
+_SMALLEST = 96
 """Smallest side of an image in a sheet, pixels."""
 _SMALL_TEXT = 11.0
 """Smallest size of text, pixels."""
@@ -76,9 +78,9 @@ class MosaicSheet:
     totals: Floats
     """Numbers (M,) in the images' corners."""
     maxima: Floats32
-    """Largest numbers (M,) of the shown part of each image."""
+    """Largest numbers (M,) of the images, or of their middle halves."""
     half: bool
-    """Whether only the middle half of each image is shown."""
+    """Whether totals and maxima are those of the middle halves, which are shown."""
     share: tuple[float, float]
     """Shown fractions of the images' width and height."""
 
@@ -97,7 +99,7 @@ def draw_sheet(
     display: Display | None = None,
     pixels: float = 6e6,
 ) -> MosaicSheet:
-    """Draw the images of modules in one picture, each ring in a row, with the modules' numbers and a colour bar.
+    """Draw the images of modules in one picture, each ring in a row or several, with the modules' numbers and a colour bar.
 
     Parameters
     ----------
@@ -105,10 +107,11 @@ def draw_sheet(
         Images (M, n_v, n_u). If they have more than `pixels` pixels together, means over blocks are drawn; small images
         are enlarged, so that the numbers do not hide them.
     numbers, rings
-        Number, or text, and ring of each module (M,). Rings are drawn in the order of their modules; a ring of more than
-        `COLUMNS` modules takes several rows.
+        Number, or text, and ring of each module (M,). Rings are drawn in the order of their modules, in rows of
+        `sheet_columns`.
     unit
-        Unit of the images, for the colour bar. Where there is room, each image has its total (`image_totals`) in a corner.
+        Unit of the images, for the colour bar. Where there is room, each image has its total (`image_totals`) in a corner:
+        that of the middle half if the display shows this, else that of the whole image.
     display
         Colours and window; the automatic window is that of all images before they are reduced.
     pixels
@@ -116,28 +119,31 @@ def draw_sheet(
     """
     display = display or Display()
     window = display.window(projections)
-    visible = display.part(projections)
-    word, values = image_totals(visible, unit)
+    visible = display.part(projections, in_mosaic=True)
+    counted = display.part(projections)  # an automatic part changes no number
+    word, values = image_totals(counted, unit)
     images = display.colored(fit_images(as_seen(visible), pixels), window)
-    tiles = tile_places(np.asarray(rings))
+    tiles = tile_places(np.asarray(rings), sheet_columns(np.asarray(rings)))
     n_v, n_u = tile = images.shape[1:3]
-    size = max(_SMALL_TEXT, min(n_v, n_u) / 5.5)
+    size = max(_SMALL_TEXT, min(n_v, n_u) / 5)
     gap = round(size / 6)
     corners = gap + tiles * (np.array(tile) + gap)
     height, width = corners.max(axis=0) + tile + gap
-    picture = np.full((height, width, 3), _BORDER, np.uint8)
-    texts = [f"{word} {value:.4g}" for value in values]
-    small = min(n_u / max(letters.width(total_text, 1.05) for total_text in texts), n_v / 5, 0.7 * size)
+    picture = np.full((max(height, math.ceil(5 * size)), width, 3), _BORDER, np.uint8)  # room for the colour bar
+    is_tall = tiles[:, 0].max() > 0  # the word stands once, below the colour bar, where there is room
+    texts = [f"{'' if is_tall else word} {number_text(value)}".strip() for value in values]
+    small = min(n_u / max(letters.width(total_text, 1.05) for total_text in texts), n_v / 5, size)
     for image, (row, column), number, total_text in zip(images, corners, np.asarray(numbers), texts, strict=True):
         picture[row : row + n_v, column : column + n_u] = image
         _write(picture, str(number), row + gap // 2, column + gap, size)
         if small >= _SMALL_TEXT:
             _write(picture, total_text, row + n_v - math.ceil(1.1 * small), column + gap, small)
-    bar = _color_bar(display, window, unit, height, max(size, height / 25))
+    note = f"tile: {word}" if is_tall and small >= _SMALL_TEXT else ""
+    bar = _color_bar(display, window, unit, note, len(picture), max(0.9 * size, height / 25))
     with_bar = np.concatenate([picture, bar], axis=1)
     share = visible.shape[2] / projections.shape[2], visible.shape[1] / projections.shape[1]
-    maxima = visible.max(axis=(1, 2))
-    return MosaicSheet(with_bar, corners, (n_v, n_u), window, word, values, maxima, display.half, share)
+    maxima = counted.max(axis=(1, 2))
+    return MosaicSheet(with_bar, corners, (n_v, n_u), window, word, values, maxima, display.shown == "half", share)
 
 
 def write_sheet(run: "ProjectionRun", path: AnyPath, display: Display | None = None) -> None:
@@ -202,6 +208,22 @@ def _means(images: Floats32, side: int) -> Floats32:
     return blocks.mean(axis=(2, 4), dtype=np.float32)
 
 
+def sheet_columns(rings: Integers) -> int:
+    """Return the number of images in a row of a sheet, of modules in `rings` (M,).
+
+    Of several rings each takes a row, or as many equal ones as rows of at most `COLUMNS` need. A single ring fills a page of
+    `_PAGE`, without empty places if a shape between `_NARROWEST` and `_WIDEST` allows it: 24 images stand as 4 rows of 6.
+    """
+    counts = np.unique(rings, return_counts=True)[1]
+    n_images = int(counts.max())
+    if len(counts) > 1:
+        return -(-n_images // -(-n_images // COLUMNS))
+    page_columns = math.sqrt(_PAGE * n_images)
+    full = [n for n in range(1, n_images + 1) if n_images % n == 0 and _NARROWEST <= n**2 / n_images <= _WIDEST]
+    nearly_full = -(-n_images // max(1, round(n_images / page_columns)))
+    return min(full, key=lambda n: abs(n - page_columns), default=nearly_full)
+
+
 def tile_places(rings: Integers, columns: int = COLUMNS) -> Integers:
     """Return row and column (M, 2) of each image, in images: a ring takes a row, or several of at most `columns` images."""
     tiles = np.empty((len(rings), 2), np.int64)
@@ -214,16 +236,18 @@ def tile_places(rings: Integers, columns: int = COLUMNS) -> Integers:
     return tiles
 
 
-def _color_bar(display: Display, window: tuple[float, float], unit: str, height: int, size: float) -> Bytes:
-    """Return a colour bar (height, width, 3) with its numbers, and with its unit above it."""
+def _color_bar(display: Display, window: tuple[float, float], unit: str, note: str, height: int, size: float) -> Bytes:
+    """Return a colour bar (height, width, 3) with its numbers, its unit above it and a note below it."""
     unit = unit_text(unit)
     line, em = math.ceil(1.1 * size), round(size)
-    top, bottom = 2 * line, height - line
+    top, bottom = 2 * line, height - (3 * line // 2 if note else 0) - line
     values = display.marks(window, min(5, max(1, (bottom - top) // line)))  # as many steps as there is room for
-    marks = [(float(display.shares(value, window)), f"{value:.4g}") for value in values]
-    columns = max(letters.width(unit, size), 1.5 * em + max(letters.width(text, size) for _, text in marks))
+    marks = [(float(display.shares(value, window)), number_text(value)) for value in values]
+    widths = [1.5 * em + letters.width(text, size) for _, text in marks]
+    columns = max(letters.width(unit, size), letters.width(note, size), *widths)
     bar = np.full((height, math.ceil(columns) + em, 3), _BORDER, np.uint8)
     _write(bar, unit, line // 3, em // 2, size, shade=1.0)
+    _write(bar, note, height - line, em // 2, size, shade=1.0)
     ramp = [display.value_at(share, window) for share in np.linspace(1.0, 0.0, bottom - top)]
     bar[top:bottom, em // 2 : em // 2 + em] = display.colored(ramp, window)[:, None]
     for share, text in marks:

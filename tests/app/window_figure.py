@@ -14,7 +14,7 @@ def steps():
     shown_in = bpy.context.preferences.view.render_display_type
     bpy.ops.mphdrr.import_geometry(filepath=str(WORKBOOK))
     bpy.ops.mphdrr.add_derenzo(voxels=48)
-    bpy.ops.mphdrr.show_modules(first=1, last=20, mode="ONLY")
+    bpy.ops.mphdrr.show_modules(modules="1-20", mode="ONLY")
     bpy.ops.wm.save_as_mainfile(filepath=str(folder / "scene.blend"))
     yield 0.5
     seen["ticks"] = 0

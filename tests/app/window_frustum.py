@@ -20,7 +20,7 @@ def steps():
     press(bpy.ops.mphdrr.add_derenzo, "EXEC_DEFAULT", voxels=160)
     yield from idle()
     phantom = bpy.context.object
-    press(bpy.ops.mphdrr.show_modules, "EXEC_DEFAULT", first=MODULE, last=MODULE, mode="ONLY")
+    press(bpy.ops.mphdrr.show_modules, "EXEC_DEFAULT", modules=str(MODULE), mode="ONLY")
     camera = bpy.data.objects[f"Module {MODULE}"]
     scene.mphdrr_geometry.active_index = next(
         i for i, o in enumerate(scene.mphdrr_geometry.scanner.all_objects) if o == camera

@@ -71,7 +71,7 @@ def steps():
     camera.select_set(True)
     bpy.context.view_layer.objects.active = camera
     scene.mphdrr_projections.width = scene.mphdrr_projections.height = 256
-    bpy.ops.mphdrr.show_modules(first=50, last=60, mode="ONLY")  # drawn in software, slowly
+    bpy.ops.mphdrr.show_modules(modules="50-60", mode="ONLY")  # drawn in software, slowly
     phantom.display_type = "BOUNDS"
     yield from drawn()
     off = []

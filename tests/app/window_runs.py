@@ -21,11 +21,21 @@ def changes(when: str) -> None:
     seen[when] = runs.change_lines(bpy.context.scene)
 
 
+def there_and_back():
+    """Undo the last step and redo it; note what the Image Editor shows after each."""
+    for step in (bpy.ops.ed.undo, bpy.ops.ed.redo):
+        step()
+        yield from drawn()
+        image = editor("IMAGE_EDITOR")[1].spaces.active.image
+        seen.setdefault("pictures", []).append(image and image.name)
+
+
 def steps():
     """Yield seconds to wait."""
     editor()[1].spaces.active.show_region_ui = True
     press(bpy.ops.mphdrr.load_example)
     yield from idle()
+    yield from there_and_back()
     editor("IMAGE_EDITOR")[1].spaces.active.show_region_ui = True
     changes("loaded")
     yield from drawn()
@@ -48,6 +58,7 @@ def steps():
     press(bpy.ops.mphdrr.render_projections, volume=runs.volume_to_render(bpy.context.scene))
     yield from idle()
     yield from drawn()
+    yield from there_and_back()
     changes("rendered")
     bpy.context.scene.mphdrr_projections.active_run = 0  # as a click in the list does, which starts a job
     yield lambda: runs.shown_run(bpy.context.scene).name == "As imported"

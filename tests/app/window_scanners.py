@@ -102,7 +102,7 @@ def steps():
     seen["middle"] = free_place(Vector())
     for name, first in (("A", 30), ("B", 60)):
         bpy.ops.mphdrr.import_geometry("EXEC_DEFAULT", True, filepath=str(WORKBOOK), name=name, replace=True)
-        bpy.ops.mphdrr.show_modules(first=first, last=first, mode="ONLY")
+        bpy.ops.mphdrr.show_modules(modules=str(first), mode="ONLY")
     yield from drawn()
     seen["imported"] = state()
     look_at_back("A", 30)

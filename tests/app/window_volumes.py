@@ -84,7 +84,7 @@ def steps():
         child.hide_set(True)
     press(bpy.ops.mphdrr.import_geometry, "EXEC_DEFAULT", filepath=str(WORKBOOK))
     press(bpy.ops.mphdrr.add_map, "EXEC_DEFAULT", quantity="sensitivity", voxels=32)
-    press(bpy.ops.mphdrr.show_modules, "EXEC_DEFAULT", first=1, last=40, mode="ONLY")
+    press(bpy.ops.mphdrr.show_modules, "EXEC_DEFAULT", modules="1-40", mode="ONLY")
     look(420.0, (1.05, 0.0, 0.95), (0.0, 0.0, -30.0))
     yield from drawn()
     picture("map")

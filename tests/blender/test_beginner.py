@@ -15,6 +15,7 @@ import pytest
 import mphdrr.core as mph
 from mphdrr.addon import example, next_step, registration
 from mphdrr.addon.blender import storage
+from mphdrr.addon.pictures import planes
 from mphdrr.addon.scanner import scanner
 from mphdrr.addon.volumes import slices, volumes
 
@@ -265,6 +266,11 @@ def test_ct_attenuation_spect_and_dose_are_six_clicks(scene, monkeypatch):
     monkeypatch.setattr(example, "_VOXELS", 32)
     monkeypatch.setitem(example._RING, "shape", (24, 32))
     assert bpy.ops.mphdrr.load_example(example="XRAY") == {"FINISHED"}
+    update()
+    assert not bpy.context.selected_objects and not any(o.visible_get() for o in scene.objects if o.type == "LIGHT")
+    assert [o.name for o in planes.planes(scene) if o.visible_get()] == ["Projection 18"], (
+        "on the one panel that is shown"
+    )
     settings, reconstruction = scene.mphdrr_projections, scene.mphdrr_reconstruction
     ct_run = mph.read_run(storage.absolute(settings.run_file))
     assert settings.model == "SPECTRAL" and settings.noise and len(ct_run.system) == 24

@@ -90,9 +90,41 @@ def test_the_display_changes_pictures_and_leaves_numbers(projected, scene):
     assert settings.problem and np.array_equal(images.projection_array(bpy.data.images[name]), before)
 
 
+@pytest.mark.parametrize(("part", "cut"), [("OBJECT", (15, 18)), ("HALF", (10, 12)), ("WHOLE", (0, 0))])
+def test_a_readout_names_the_pixel_whose_colour_is_under_the_pointer(projected, scene, part, cut):
+    """Whatever part the tiles show: the number has the colour of the place, and the pixel is within the part."""
+    projected()
+    settings, mosaic = scene.mphdrr_display, bpy.data.images[ids.MOSAIC]
+    settings.shown = part
+    assert settings.shown == part and (settings.half, settings.whole) == (part == "HALF", part == "WHOLE")
+    shown, picture, rng = images.tiles(mosaic), pixels(mosaic)[::-1, :, :3], np.random.default_rng(2)
+    display, rows, columns = settings.display(), set(), set()
+    for corner in np.reshape(shown["corners"], (-1, 2)):
+        for place in corner + np.array(shown["tile"]) * rng.uniform(
+            (0.3, 0.0), (0.7, 1.0), (30, 2)
+        ):  # beside the texts
+            text, value = tiles.value_at(mosaic, place[1] / mosaic.size[0], 1 - place[0] / mosaic.size[1])
+            expected = display.colored([value], shown["window"])[0]
+            np.testing.assert_array_equal(np.rint(255 * picture[*place.astype(int)]), expected)
+            column, row = (int(word.rstrip(",")) for word in text.split()[3::2])
+            rows.add(row), columns.add(column)
+    assert cut[0] <= min(rows) and max(rows) < 40 - cut[0] and {cut[1], 49 - cut[1]} <= columns
+    assert set(columns) == set(range(cut[1], 50 - cut[1]))
+
+
+def test_the_part_that_an_earlier_file_or_a_script_sets_is_the_one_in_the_panel(scene):
+    settings = scene.mphdrr_display
+    assert settings.shown == "OBJECT"
+    settings.half = True
+    assert settings.shown == "HALF" and settings.display().shown == "half"
+    settings.shown = "OBJECT"
+    assert not settings.half and settings.display().shown == "object"
+
+
 def test_a_number_picked_from_a_picture_is_the_exact_one_and_becomes_an_end_of_the_window(projected, scene):
     projected()
     settings, mosaic = scene.mphdrr_display, bpy.data.images[ids.MOSAIC]
+    settings.shown = "WHOLE"
     shown = images.tiles(mosaic)
     exact = images.projection_array(bpy.data.images[ids.projection_name(5, 8)])
     row, column = np.unravel_index(exact.argmax(), exact.shape)
@@ -173,9 +205,9 @@ def test_planes_of_the_active_module_its_ring_or_all_that_are_visible(projected,
         return [plane.mphdrr_module.number for plane in made if not plane.hide_viewport]
 
     assert shown() == list(range(1, 9))
-    scanner.show_modules(collection, 2, 3)
+    scanner.show_modules(collection, "2-3")
     assert shown() == [2, 3]
-    scanner.show_modules(collection, 0, 0, "ALL")
+    scanner.show_modules(collection, mode="ALL")
     selection.select(bpy.context, [scanner.module(collection, 6)])
     for mode, numbers in (("ACTIVE", [6]), ("RING", [5, 6, 7, 8]), ("NONE", [])):
         settings.planes = mode
@@ -286,7 +318,7 @@ def test_the_newest_display_wins_and_no_earlier_run_is_painted(projected, scene,
     projected(width=20, height=20)
     for _ in steps:
         assert images.projection_array(bpy.data.images[ids.projection_name(8, 8)]).shape == (20, 20)
-    assert shows(Display("grey"))
+    assert shows(Display("grey", shown="object"))
     scene.mphdrr_display.colors = "MAGMA"
     steps = recoloring.recoloring()
     while images.tiles(bpy.data.images[ids.MOSAIC])["display"] != "None":  # until the mosaic is made
@@ -294,8 +326,8 @@ def test_the_newest_display_wins_and_no_earlier_run_is_painted(projected, scene,
     scene.mphdrr_display.scale = "LOG"
     for _ in steps:
         pass
-    assert shows(Display("magma", "log"))
+    assert shows(Display("magma", "log", shown="object"))
     scene.mphdrr_display.colors = "VIRIDIS"
-    assert not shows(Display("viridis", "log"))
+    assert not shows(Display("viridis", "log", shown="object"))
     recoloring.check()  # as after an undo
-    assert shows(Display("viridis", "log"))
+    assert shows(Display("viridis", "log", shown="object"))

@@ -176,8 +176,8 @@ def test_pixels_and_places_in_pictures_are_one_to_one(projected, scene, half, de
         shown = tiles.shown_pictures(image)
         assert [picture.number for picture in shown] == (run.numbers if image.name == ids.MOSAIC else [7])
         for picture in shown:
-            share = 0.25 if picture.half else 0.0
-            within = rng.uniform(share + 0.02, 0.98 - share, (5, 2)) * [pixels[0], pixels[1]] - 0.5
+            left_out = 0.5 - 0.5 * np.array(picture.share)
+            within = rng.uniform(left_out + 0.02, 0.98 - left_out, (5, 2)) * [pixels[0], pixels[1]] - 0.5
             places = picture.image_positions(within, shape)
             np.testing.assert_allclose(picture.projection_pixels(places, shape), within, atol=1e-9)
             width, height = image.size

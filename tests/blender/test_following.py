@@ -172,7 +172,7 @@ def test_the_panels_follow_the_selection(scene, a_and_b):
     scene.mphdrr_geometry.active_index = b.all_objects.find(scanner.module(b, 7).name)
     update()
     assert shown(scene) == ("B", 7, 7) and bpy.context.selected_objects == [scanner.module(b, 7)]
-    scanner.show_modules(a, 5, 5)
+    scanner.show_modules(a, "5-5")
     scene.mphdrr_geometry.scanner = a
     scene.mphdrr_geometry.active_index = a.all_objects.find(scanner.module(a, 8).name)
     update()
@@ -186,7 +186,7 @@ def test_each_edit_changes_the_selected_one(scene, a_and_b):
         panel = scanner.active_scanner(scene)
         panel.mphdrr_scanner.detector_thickness = 7.5
         selection.active_module(bpy.context).mphdrr_module.pinhole_diameter = 3.5
-        bpy.ops.mphdrr.show_modules(first=4, last=5, mode="ONLY")
+        bpy.ops.mphdrr.show_modules(modules="4-5", mode="ONLY")
         bpy.ops.mphdrr.duplicate_modules(count=1, angle=np.radians(14))
         select(scanner.module(mine, 5))
         bpy.ops.mphdrr.remove_modules()
@@ -194,7 +194,7 @@ def test_each_edit_changes_the_selected_one(scene, a_and_b):
         assert 5 not in now.numbers and (now.detector_thickness == 7.5).all() and 3.5 in now.pinhole_diameter
         assert_same(scanner.read_scanner(other), before)
         mine.mphdrr_scanner.detector_thickness = 9.5
-        scanner.show_modules(mine, 0, 0, "ALL")
+        scanner.show_modules(mine, mode="ALL")
 
 
 def test_a_run_belongs_to_its_scanner(scene, a_and_b, box):

@@ -80,11 +80,11 @@ def test_bad_files_are_refused_in_one_line_and_add_nothing(tmp_path, name, setti
 def test_ct_begins_with_a_window_of_its_own_and_keeps_the_users(ct):
     item = volumes.add_volume(ct, "CT")
     settings = item.mphdrr_volume
-    assert (settings.display_low, settings.display_high) == (-200, 1000)
+    assert (settings.display_low, settings.display_high) == (-160, 240)
     settings.display_low = 50.0
     _replace(item, Volume(ct.array[:5].copy(), Grid((5, 11, 7), AFFINE), "hu"))
     node = item.data.materials[0].node_tree.nodes["Look"]
-    assert node.inputs["Low"].default_value == 50.0 and node.inputs["High"].default_value == 1000.0
+    assert node.inputs["Low"].default_value == 50.0 and node.inputs["High"].default_value == 240.0
 
 
 def test_solid_viewport_gets_no_value_below_0(ct):
@@ -136,6 +136,7 @@ def test_slices_show_the_voxels_where_they_are(ct):
 def test_slices_follow_new_voxels_and_go(ct):
     item = volumes.add_volume(ct, "CT")
     kinds = "objects", "images", "meshes", "materials"
+    slices.remove_slices(item)
     before = datablocks(*kinds)
     slices.add_slices(item)
     _replace(item, Volume(ct.array[:5].copy(), Grid((5, 11, 7), AFFINE), "hu"))

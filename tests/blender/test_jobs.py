@@ -240,10 +240,17 @@ def test_a_job_says_what_it_does_and_how_long(monkeypatch):
         now[0] += seconds
         project(done, 80)
         seen.append(worker.text)
+    now[0] += 9.0
+    project(80, 80)
+    seen.append(worker.text)
+    worker._begin("reconstructing")(120, 320)
+    now[0] += 1800.0
+    seen.append(worker.text)
     worker._begin("compiling once")
     now[0] += 9.7
     seen.append(worker.text)
-    assert seen == ["Projecting 10 of 80", "Projecting 20 of 80, 15 s left", "Compiling once, 10 s"]
+    few = ["Projecting 10 of 80", "Projecting 20 of 80, 15 s left", "Projecting 80 of 80"]
+    assert seen == [*few, "Reconstructing 38 %, 50 min left", "Compiling once, 10 s"]
     worker.cancel.set()
     assert worker.text == "Compiling once: stopping"
     with pytest.raises(Cancelled):

@@ -20,6 +20,7 @@ from mphdrr.core.physics.ct_numbers import hu_to_mu
 from mphdrr.core.physics.maps import sensitivity_map
 from mphdrr.core.physics.materials import attenuation
 from mphdrr.core.physics.performance import sensitivity
+from mphdrr.core.runs.display import Display
 from mphdrr.core.volumes.volume import Volume
 
 from .conftest import datablocks, refused, reopened, slice_pixels, update
@@ -35,9 +36,9 @@ def nema(scene, body):
     return volumes.add_volume(body, "NEMA Body")
 
 
-def surface(item) -> tuple[np.ndarray, np.ndarray]:
-    """Return vertices (n, 3) in the object's space and edges (m, 2) of the surface that Blender draws."""
-    made = looks.surface_of(item)
+def surface(item, number: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    """Return vertices (n, 3) in the object's space and edges (m, 2) of a surface that Blender draws."""
+    made = looks.surfaces_of(item)[number]
     update()
     mesh = made.evaluated_get(bpy.context.evaluated_depsgraph_get()).data
     vertices = np.array([made.matrix_local @ vertex.co for vertex in mesh.vertices]).reshape(-1, 3)
@@ -145,7 +146,7 @@ def test_presets_of_a_ct(scene):
     for look in ("BONE", "LUNG", "SOFT"):
         item.mphdrr_volume.look = look
         sides[look] = np.ptp(surface(item)[0], axis=0).max()
-    assert sides["BONE"] < 4.0 and 8.0 < sides["SOFT"] < 10.0  # one voxel, and five
+    assert sides["BONE"] < 4.0 and 8.0 < sides["SOFT"] < 12.0  # one voxel, and five to six
     assert (item.mphdrr_volume.display_low, item.mphdrr_volume.display_high) == (-160.0, 240.0)
     mu = volumes.add_volume(hu_to_mu(volumes.volume_from_object(item)), "mu").mphdrr_volume
     water, bone = attenuation("water", 140.5), attenuation("bone", 140.5)
@@ -153,6 +154,36 @@ def test_presets_of_a_ct(scene):
     assert mu.display_low < water < mu.display_high < bone and mu.unit == "1/mm"
     mu.look = "BONE"
     assert water < mu.surface < bone
+
+
+def test_bones_stand_in_the_skin_which_is_cut_open_at_the_slices(scene):
+    array = np.full((20, 20, 20), -1000.0)
+    array[2:18, 2:18, 2:18], array[8:12, 8:12, 4:16] = -100.0, 900.0  # fat around a bone
+    item = volumes.add_volume(Volume(array, Grid.centered(20, 2.0), "hu"), "CT")
+    settings = item.mphdrr_volume
+    assert settings.look == "BONE" and len(slices.planes_of(item)) == 3
+    assert (settings.display_low, settings.display_high) == (-160.0, 240.0)
+    bone, skin = surface(item)[0], surface(item, 1)[0]
+    assert np.ptp(bone, axis=0) == pytest.approx([8.0, 8.0, 24.0], abs=2.0)
+    assert np.ptp(skin, axis=0) == pytest.approx([32.0, 32.0, 32.0], abs=2.0)
+    is_cut_away = lambda vertices: (vertices * [1, -1, 1] > 2.0).all(axis=1).any()  # noqa: E731
+    assert is_cut_away(bone) and not is_cut_away(skin)
+
+
+def test_a_ct_makes_way_for_its_attenuation_and_undo_brings_it_back(scene):
+    volumes.add_volume(Volume(np.full((9, 9, 9), 40.0), Grid.centered(9, 2.0), "hu"), "CT")
+    bpy.context.view_layer.objects.active = bpy.data.objects["CT"]
+    bpy.ops.ed.undo_push(message="before")
+    assert bpy.ops.mphdrr.ct_to_attenuation() == {"FINISHED"}
+    bpy.ops.ed.undo_push(message="made")
+    mu = bpy.data.objects["CT mu"]
+    assert bpy.data.objects["CT"].hide_get() and not mu.hide_get() and mu.mphdrr_volume.look == "BONE"
+    update()
+    assert [child.name for child in bpy.data.objects["CT"].children if child.visible_get()] == []
+    water = attenuation("water", 140.5)
+    assert mu.mphdrr_volume.display_low < water < mu.mphdrr_volume.display_high < mu.mphdrr_volume.surface
+    bpy.ops.ed.undo()
+    assert "CT mu" not in bpy.data.objects and not bpy.data.objects["CT"].hide_get()
 
 
 def test_slices_of_nema_show_six_spheres_also_after_reopening(nema, tmp_path):
@@ -200,7 +231,17 @@ def test_a_map_of_an_older_file_is_shown_in_the_same_unit(scene, tmp_path):
     assert settings.unit == "cps/MBq" and settings.display_high == pytest.approx(shown) == pytest.approx(200.0)
 
 
-def test_crystals_phantoms_maps_and_the_selection_share_no_hue(scene):
+def test_activity_has_the_colours_of_the_mosaic_on_slices_and_as_smoke(nema):
+    values = np.linspace(0.0, 1.0, 256)
+    expected = Display().colored(values, (0.0, 1.0)) / 255
+    assert np.abs(slices.color_table("activity")[:, :3] - expected).max() < 0.025
+    for smoke in (False, True):
+        shown = slices.color_table("", volume_materials.item_ramp(nema, smoke))[:, :3]
+        assert np.abs(shown - expected).max() < 0.025
+    assert Display().colors == "inferno" == bpy.context.scene.mphdrr_display.colors.lower()
+
+
+def test_crystals_maps_and_the_selection_share_no_hue(scene):
     theme = bpy.context.preferences.themes[0].view_3d
     assert volume_materials.ramp("hu") == volume_materials.ramp("mu") != volume_materials.ramp("activity")
 
@@ -213,7 +254,7 @@ def test_crystals_phantoms_maps_and_the_selection_share_no_hue(scene):
         return hues(*np.column_stack([np.interp(shares, positions, channel) for channel in np.transpose(colors)]))
 
     found = {
-        "crystal": hues(LOOKS["crystal"].color), "phantom": ramp("activity"), "map": ramp("resolution"),
+        "crystal": hues(LOOKS["crystal"].color), "map": ramp("resolution"),
         "selection": hues(theme.object_selected, theme.object_active),
     }  # fmt: skip
     for name, one in found.items():

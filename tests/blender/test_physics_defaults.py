@@ -89,14 +89,18 @@ def test_a_recipe_says_the_model_whatever_its_volume_holds(settings, objects, tm
     assert settings.volume == objects["activity"] and settings.model == "TRANSMISSION"
 
 
-def test_all_modules_or_a_range_of_real_numbers(ring, settings, ring_system):
-    assert settings.all_modules
-    settings.all_modules = False
-    assert (settings.first, settings.last) == (min(ring_system.numbers), max(ring_system.numbers))
-    settings.first = 3
-    assert not settings.all_modules
-    settings.all_modules = True
+def test_modules_are_one_text_that_stands_for_an_earlier_versions_range(settings):
+    """Files, drivers and scripts of earlier versions have first and last; 0 is the lowest or the highest."""
+    assert settings.modules == ""
+    settings.first, settings.last = 3, 5
+    assert settings.modules == runs.panel_recipe(settings.id_data)["system.modules"] == "3-5"
+    settings.first = 0
+    assert settings.modules == "-5"
+    settings.modules = "1-2, 7"
     assert (settings.first, settings.last) == (0, 0)
+    assert settings.modules == runs.panel_recipe(settings.id_data)["system.modules"] == "1-2, 7"
+    settings.modules = ""
+    assert runs.panel_recipe(settings.id_data)["system.modules"] is None
 
 
 @pytest.mark.parametrize("name", list(PRESETS)[::5])

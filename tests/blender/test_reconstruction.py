@@ -12,6 +12,7 @@ import pytest
 import mphdrr.core as mph
 from mphdrr.addon.blender import ids, jobs, plots, storage, windows
 from mphdrr.addon.perspective import color_bar
+from mphdrr.addon.pictures import planes
 from mphdrr.addon.reconstruction import backprojections, reconstructions
 from mphdrr.addon.reconstruction.reconstruction_properties import (
     PROPERTIES,
@@ -25,7 +26,7 @@ from mphdrr.core.reconstruction.methods import METHODS, Method
 from mphdrr.core.runs.files import read_run
 from mphdrr.core.runs.run_recipe import run_truth
 from mphdrr.core.runs.settings import SETTINGS
-from mphdrr.core.volumes.sights import bright_value, full_slices
+from mphdrr.core.volumes.sights import full_slices
 
 from .conftest import Drawn, cancelled, datablocks, refused
 
@@ -88,10 +89,35 @@ def test_the_volume_is_that_of_the_command_line(render, scene):
     rods = mph.score_volume(expected.volume, *run_truth(run)).derenzo
     assert [tuple(row) for row in known["rods"]] == [sector.cells for sector in rods if sector.rod_diameter]
     assert bpy.data.objects["Derenzo"].hide_get(), "the truth stands where the reconstruction is"
-    planes, at = slices.planes_of(item), full_slices(expected.volume.array)
-    assert len(planes) == 3 and item.mphdrr_volume.slices[:] == tuple(at)
-    assert item.mphdrr_volume.display_high == pytest.approx(bright_value(expected.volume.array), rel=1e-5)
+    at = full_slices(expected.volume.array)
+    assert len(slices.planes_of(item)) == 3 and item.mphdrr_volume.slices[:] == tuple(at)
+    truth, look = mph.resample(run.volume, expected.volume.grid, "mean"), item.mphdrr_volume
+    assert look.display_high == pytest.approx(truth.array.max(), rel=1e-5), "as in the picture of its slices"
+    assert look.look == "SHELL" and look.surface == pytest.approx(0.4 * look.display_high)
     assert bpy.data.images[ids.RECONSTRUCTION].size[:] == (1600, 850)
+
+
+def are_planes_hidden(scene) -> bool:
+    (is_hidden,) = {plane.hide_get() for plane in planes.planes(scene)}
+    return is_hidden
+
+
+def test_projections_make_way_for_the_result_until_they_are_wanted(render, scene):
+    bpy.ops.ed.undo_push(message="before")
+    bpy.ops.mphdrr.reconstruct(**SMALL)
+    bpy.ops.ed.undo_push(message="reconstructed")
+    assert are_planes_hidden(scene)
+    bpy.ops.ed.undo()
+    scene = bpy.context.scene
+    assert not are_planes_hidden(scene) and not bpy.data.objects["Derenzo"].hide_get()
+    bpy.ops.ed.redo()
+    scene = bpy.context.scene
+    assert are_planes_hidden(scene) and bpy.data.objects["Derenzo"].hide_get()
+    scene.mphdrr_display.planes = "RING"
+    assert not are_planes_hidden(scene), "an edit shows them"
+    bpy.ops.mphdrr.reconstruct(**SMALL)
+    assert are_planes_hidden(scene) and bpy.ops.mphdrr.render_projections() == {"FINISHED"}
+    assert not are_planes_hidden(scene), "so does another run"
 
 
 def test_panel_settings_count_and_scripts_override_them(render, scene):
@@ -232,7 +258,12 @@ def test_it_is_shown_while_it_runs_and_cancelled_without_a_trace(render, scene, 
 
     cancelled(job, has_two)
     assert sorted(set(seen)) == [1, 2]
-    assert state() == before and reconstructed() is None and not bpy.data.objects["Derenzo"].hide_get()
+    assert (
+        state() == before
+        and reconstructed() is None
+        and not are_planes_hidden(scene)
+        and not bpy.data.objects["Derenzo"].hide_get()
+    )
 
 
 def test_finish_now_keeps_what_there_is(render, scene, in_window):

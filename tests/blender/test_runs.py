@@ -12,7 +12,7 @@ import pytest
 
 from mphdrr.addon import registration
 from mphdrr.addon.blender import ids, storage
-from mphdrr.addon.pictures import images, planes
+from mphdrr.addon.pictures import images, planes, tiles
 from mphdrr.addon.runs import rendering, runs
 from mphdrr.addon.scanner import scanner
 from mphdrr.addon.volumes import volumes
@@ -245,6 +245,10 @@ def test_the_difference_of_two_runs_is_drawn_and_said(render, scene, capfd):
     pixels = np.array(image.pixels[:]).reshape(-1, 4)
     assert (pixels[:, 0] - pixels[:, 2]).max() > 0.4 and (pixels[:, 2] - pixels[:, 0]).max() > 0.4
     assert found.text in " ".join(Drawn("MPHDRR_PT_runs").texts)
+    scene.mphdrr_display.half = True  # of the mosaic: a difference shows all of each image, here its first corner
+    row, column = images.tiles(image)["corners"][:2]
+    picked = tiles.value_at(image, (column + 0.5) / image.size[0], 1 - (row + 0.5) / image.size[1])
+    assert picked[0] == "mphDRR 01, column 11, row 9"
     set_(width=14)
     render()
     assert ids.DIFFERENCE not in bpy.data.images, "it belonged to the run that was shown"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import subprocess
 import sys
 
@@ -55,8 +54,8 @@ def test_scanner_has_a_collection_per_ring_and_a_camera_per_module(scene, dc_spe
     assert [o.name for o in found[:2]] == ["Module 01", "Module 02"]
     assert [o.mphdrr_module.number for o in found] == list(range(1, 81))
     assert scene.unit_settings.scale_length == pytest.approx(0.001)
-    assert scanner.quick_ranges(dc_spect) == [(1, 40), (21, 60), (41, 80)]
-    assert json.loads(collection.mphdrr_scanner.quick_ranges) == [[1, 40], [21, 60], [41, 80]]
+    assert scanner.quick_ranges(dc_spect.numbers, dc_spect.rings()) == ["1-40", "21-60", "41-80"]
+    assert scanner.suggested_ranges(None, bpy.context, "") == ["1-40", "21-60", "41-80"]
     assert sum(o.type == "MESH" for o in collection.all_objects) == 161
     meshes = {o.data for o in collection.all_objects if o.type == "MESH"}
     assert len(meshes) == 161, "each has its own, which is reshaped in place"
@@ -100,7 +99,7 @@ def test_moved_camera_and_edited_number_are_read(ring, ring_system):
 
 
 def test_hidden_or_parented_camera_is_read_where_it_is(scene, ring, ring_system):
-    scanner.show_modules(ring, 1, 1, "ONLY")
+    scanner.show_modules(ring, "1-1", "ONLY")
     update()
     bench = bpy.data.objects.new("Bench", None)
     scene.collection.objects.link(bench)
@@ -197,20 +196,43 @@ def test_modules_are_shown_by_range(scene, ring, ring_system):
                 shown.append(camera.mphdrr_module.number)
         return shown
 
-    assert scanner.show_modules(ring, 2, 4) == 3
+    assert scanner.show_modules(ring, "2-4") == 3
     assert visible() == [2, 3, 4]
-    scanner.show_modules(ring, 7, 9, "SHOW")
+    scanner.show_modules(ring, "7-9", "SHOW")
     assert visible() == [2, 3, 4, 7, 8]
-    scanner.show_modules(ring, 1, 3, "HIDE")
+    scanner.show_modules(ring, "1-3", "HIDE")
     assert visible() == [4, 7, 8]
     scanner.module(ring, 4).mphdrr_module.visible = False
     assert visible() == [7, 8]
     scanner.build_scanner(scene, ring_system, "Ring")
     assert visible() == [7, 8], "importing again keeps what is hidden"
-    scanner.show_modules(ring, 0, 0, "ALL")
+    scanner.show_modules(ring, mode="ALL")
     assert visible() == list(range(1, 9))
-    with pytest.raises(InputError, match="no module between 9 and 20"):
-        scanner.show_modules(ring, 9, 20)
+    with pytest.raises(InputError, match="no module 9-20; there are 1 to 8"):
+        scanner.show_modules(ring, "9-20")
+
+
+def test_the_modules_that_are_visible_are_one_text(scene, ring):
+    state = scene.mphdrr_geometry
+
+    def visible():
+        return [camera.mphdrr_module.number for camera in scanner.modules(ring) if not camera.hide_viewport]
+
+    assert state.visible == ""
+    state.visible = "2-4, 7"
+    assert visible() == [2, 3, 4, 7] and state.visible == "2-4, 7"
+    scanner.module(ring, 3).mphdrr_module.visible = False
+    assert state.visible == "2, 4, 7", "what is shown, however it came so"
+    for text, reason in (
+        ("9-20", "no module 9-20; there are 1 to 8"),
+        ("a", "expected numbers such as 1-40 or 1-20,41"),
+    ):
+        state.visible = text
+        assert reason in state.visible_problem and visible() == [2, 4, 7]
+    state.visible = ""
+    assert visible() == list(range(1, 9)) and (state.visible, state.visible_problem) == ("", "")
+    scanner.show_modules(ring, mode="HIDE")
+    assert state.visible == "none"
 
 
 @pytest.mark.long

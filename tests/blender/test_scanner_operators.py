@@ -48,13 +48,13 @@ def test_bad_file_is_one_readable_line_and_leaves_the_scene(scene, tmp_path, nam
 
 
 def test_show_and_look_through(scene, imported):
-    bpy.ops.mphdrr.show_modules(first=5, last=12, mode="ONLY")
+    bpy.ops.mphdrr.show_modules(modules="5-12", mode="ONLY")
     found = scanner.modules(imported)
     assert [o.mphdrr_module.number for o in found if not o.hide_render] == list(range(5, 13))
     bpy.ops.mphdrr.look_through_module(number=11)
     assert scene.camera.name == "Module 11"
     refused(bpy.ops.mphdrr.look_through_module, "no module 99", number=99)
-    refused(bpy.ops.mphdrr.show_modules, "no module between", first=100, last=120)
+    refused(bpy.ops.mphdrr.show_modules, "no module 100-120; there are 1 to", modules="100-120")
 
 
 def test_import_again_keeps_the_pictures_behind_cameras(imported, small_workbook):

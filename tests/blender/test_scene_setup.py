@@ -126,7 +126,7 @@ def test_lines_of_sight_are_those_of_the_cameras(scene, ring, ring_system):
     views_ = ring_system.views((16, 16), magnification=scene.mphdrr_projections.magnification)
     assert np.allclose(ray, [views_.sources[2], views_.detector_centers[2]], atol=1e-3)
     state.sight_all = True
-    scanner.show_modules(ring, 2, 8)
+    scanner.show_modules(ring, "2-8")
     update()
     drawn = sight_lines.lines(bpy.context)
     assert [len(drawn[name]) for name in ("show_rays", "show_frustums", "show_detectors")] == [7, 28, 28]

@@ -171,12 +171,12 @@ def test_volume_drawn_for_another_blender_is_rewritten_on_load(tmp_path, sparse_
     monkeypatch.setattr(compat, "VDB_CENTER_SHIFT", -0.5 - compat.VDB_CENTER_SHIFT)
     item = volumes.add_volume(sparse_volume, "Sample")
     item.mphdrr_volume.look = "SHELL"
-    elsewhere = looks.surface_of(item).location.copy()
+    elsewhere = looks.surfaces_of(item)[0].location.copy()
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "a.blend"))
     monkeypatch.undo()
     bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "a.blend"))
     item = bpy.data.objects["Sample"]
     assert item.mphdrr_volume.center_shift == compat.VDB_CENTER_SHIFT
     assert np.array_equal(volumes.volume_from_object(item).array, sparse_volume.array)
-    assert looks.surface_of(item).location != elsewhere, "the surface goes along"
+    assert looks.surfaces_of(item)[0].location != elsewhere, "the surface goes along"
     assert len({p.name for p in (tmp_path / "a_mphdrr").iterdir()}) == 2

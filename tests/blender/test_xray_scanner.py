@@ -91,6 +91,26 @@ def add_body(shape, spacing: float) -> mph.Volume:
     return volume
 
 
+def test_only_the_active_sources_panel_is_shown(collection, scene):
+    modules = scanner.modules(collection)
+    panels = {o.parent: o for o in collection.all_objects if o.mphdrr_module.part == "PANEL"}
+
+    def shown() -> list[bpy.types.Object]:
+        update()
+        return [camera for camera in modules if not panels[camera].hide_viewport]
+
+    for camera in reversed(modules):
+        bpy.context.view_layer.objects.active = camera
+        assert shown() == [camera] and not panels[modules[0]].hide_render
+    scanner.set_visible(modules[0], False)
+    assert shown() == []
+    scanner.set_visible(modules[0], True)
+    assert shown() == modules[:1]
+    scene.mphdrr_geometry.scanner = next(c for c in scanner.scanners(scene) if c != collection)
+    bpy.context.view_layer.objects.active = None
+    assert shown() == []
+
+
 def test_both_scanners_of_a_workbook_are_imported_and_kept(scene, collection, system, tmp_path):
     assert len(scanner.read_scanner(scanner.find_scanner(scene, "both"))) == 16
     assert_same(scanner.read_scanner(collection), system)

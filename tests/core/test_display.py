@@ -7,9 +7,9 @@ from hypothesis import strategies as st
 from PIL import Image
 
 import mphdrr.core as mph
-from mphdrr.core.runs.display import COLORS, SCALES, Display
-from mphdrr.core.runs.letters import text_ink, width
-from mphdrr.core.runs.mosaic import draw_sheet, image_totals, write_png
+from mphdrr.core.runs.display import COLORS, SCALES, Display, number_text
+from mphdrr.core.runs.letters import text_ink, width, wrap_text
+from mphdrr.core.runs.mosaic import draw_sheet, image_totals, sheet_columns, tile_places, write_png
 
 from .conftest import refused
 
@@ -65,6 +65,7 @@ def test_numbers_outside_a_window_have_its_ends_colours_and_no_number_has_the_fi
     [
         ({"colors": "jet"}, "colors 'jet': expected one of inferno"),
         ({"scale": "cube"}, "scale 'cube': expected one of linear"),
+        ({"shown": "all"}, "shown 'all': expected one of object, half, whole"),
         ({"low": 3, "high": 3}, "expected low to be less than high"),
         ({"scale": "log", "low": 0}, "expected more than 0 on the logarithmic scale"),
         ({"high": np.inf}, "expected a finite number"),
@@ -74,7 +75,7 @@ def test_displays_that_cannot_be(settings, said):
     refused(lambda: Display(**settings), said)
 
 
-@pytest.mark.parametrize(("shape", "factor"), [((70, 80), 1.0), ((20, 30), 3.0), ((200, 160), 0.5)])
+@pytest.mark.parametrize(("shape", "factor"), [((100, 96), 1.0), ((20, 30), 4.0), ((200, 160), 0.5)])
 def test_every_image_stands_in_its_rings_row_as_the_pinhole_sees_it(shape, factor):
     rings = np.repeat([0, 1], [3, 5])
     images = np.random.default_rng(2).random((8, *shape), np.float32) * 70
@@ -90,7 +91,33 @@ def test_every_image_stands_in_its_rings_row_as_the_pinhole_sees_it(shape, facto
         assert np.all(between == between[0]), "the images do not touch"
         if factor == 1:  # all but the number and the total in the corners
             wanted = Display().colored(mph.as_seen(images[m]), drawn.window)
-            np.testing.assert_array_equal(own[20:-16], wanted[20:-16])
+            np.testing.assert_array_equal(own[26:-24], wanted[26:-24])
+
+
+@pytest.mark.parametrize("rings", [[24], [1], [10], [23], [80], [100], [360], [20, 20, 20, 20], [30, 30], [41, 7]])
+def test_a_sheet_has_the_shape_of_a_page_or_a_row_for_each_ring(rings):
+    columns = sheet_columns(np.repeat(np.arange(len(rings)), rings))
+    tiles = tile_places(np.repeat(np.arange(len(rings)), rings), columns)
+    assert len(set(map(tuple, tiles))) == sum(rings) and columns == tiles[:, 1].max() + 1, "no column is empty"
+    rows = int(tiles[:, 0].max()) + 1
+    if len(rings) > 1:
+        assert columns <= 20 and rows == sum(-(-n // 20) for n in rings)
+    elif any(sum(rings) % k == 0 and k * k <= sum(rings) <= 2.5 * k * k for k in range(1, 21)):
+        assert rows * columns == sum(rings) and rows <= columns <= 2.5 * rows, "no tile is empty"
+    else:
+        assert rows * columns - sum(rings) < columns and 0.9 * rows <= columns <= 2.5 * rows
+    assert rings != [24] or (rows, columns) == (4, 6)
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [(-0.0, "0"), (0.25, "0.25"), (-3.0, "−3"), (16384, "16380"), (1e5, "10⁵"), (-1e7, "−10⁷"), (3.349e11, "3.349 × 10¹¹"),
+     (2.5e-7, "2.5 × 10⁻⁷"), (np.inf, "inf")],
+)  # fmt: skip
+def test_numbers_are_written_as_people_write_them(value, text):
+    assert number_text(value) == text
+    unknown = text_ink("?", 48)[0]
+    assert not any(np.array_equal(text_ink(letter, 48)[0], unknown) for letter in text)
 
 
 def has_ink(picture, text, size):
@@ -106,14 +133,18 @@ def test_every_image_has_its_sum_or_mean_and_the_bar_round_numbers(unit):
     word, values = image_totals(images, unit)
     assert word == ("sum" if unit in ("counts", "photons") else "mean")
     np.testing.assert_allclose(values, [getattr(image.astype(float), word)() for image in images], rtol=1e-12)
-    drawn, size = draw_sheet(images, [1, 2, 3], [0, 0, 0], unit), 128 / 5.5
-    texts = [f"{word} {value:.4g}" for value in values]
-    small = min(0.7 * size, 128 / max(width(text, 1.05) for text in texts))
-    for (row, column), text in zip(drawn.corners, texts, strict=True):
-        assert has_ink(drawn.picture[row : row + 128, column : column + 128], text, small)
-    bar = drawn.picture[:, drawn.corners[-1, 1] + 128 :]
+    size = 128 / 5
     assert 1.9 < images.max() < 2.0
-    assert all(has_ink(bar, text, size) for text in ("0", "1")) and not has_ink(bar, "9.9", size)
+    # In several rows the tiles have numbers alone, larger, and the word stands below the colour bar.
+    for rings, prefix, legend in (([0, 0, 0], f"{word} ", ""), ([0, 0, 1], "", f"tile: {word}")):
+        drawn = draw_sheet(images, [1, 2, 3], rings, unit)
+        texts = [f"{prefix}{number_text(value)}" for value in values]
+        small = min(size, 128 / max(width(text, 1.05) for text in texts))
+        for (row, column), text in zip(drawn.corners, texts, strict=True):
+            assert has_ink(drawn.picture[row : row + 128, column : column + 128], text, small)
+        bar = drawn.picture[:, drawn.corners[:, 1].max() + 128 :]
+        assert all(has_ink(bar, text, 0.9 * size) for text in ("0", "1", *filter(None, [legend])))
+        assert not has_ink(bar, "9.9", 0.9 * size)
 
 
 @pytest.mark.parametrize("shape", [(128, 128), (101, 126)])
@@ -122,7 +153,7 @@ def test_the_central_half_is_shown_with_its_own_totals_in_the_window_of_all(shap
     images[0, 0, 0] = 50.0
     n_v, n_u = shape
     middle = images[:, n_v // 4 : n_v - n_v // 4, n_u // 4 : n_u - n_u // 4]
-    display = Display(half=True)
+    display = Display(shown="half")
     assert np.array_equal(display.part(images), middle)
     assert np.array_equal(display.part(images[:, ::-1, ::-1]), middle[:, ::-1, ::-1]), "seen from any side"
     drawn, own = draw_sheet(images, [1, 2], [0, 0], "counts", display), Display(high=50.0)
@@ -132,12 +163,44 @@ def test_the_central_half_is_shown_with_its_own_totals_in_the_window_of_all(shap
     np.testing.assert_allclose(drawn.totals, middle.sum(axis=(1, 2), dtype=float))
 
 
+@pytest.mark.parametrize(
+    ("size", "reach", "eighths"), [(64, 8, 3), (64, 15, 4), (128, 33, 5), (50, 24, 8), (64, 31, 8)]
+)
+def test_the_object_fills_the_tiles_and_is_whole_in_all_of_them(size, reach, eighths):
+    """The object, of 1, reaches so many pixels from the middle in one of the images; the faint ground does not count."""
+    rng = np.random.default_rng(6)
+    images = rng.poisson(0.001, (3, size, size)).astype(np.float32) / 10
+    images[:, size // 2 - 4 : size // 2 + 4, size // 2 - 4 : size // 2 + 4] = 1.0
+    images[1, size // 2 - reach : size // 2, size // 2 - 3 : size // 2 + 3] = 1.0
+    shown = Display(shown="object").part(images, in_mosaic=True)
+    cut = size * (8 - eighths) // 16
+    assert np.array_equal(shown, images[:, cut : size - cut, cut : size - cut])
+    drawn, whole = (
+        draw_sheet(images, [1, 2, 3], [0] * 3, "counts", Display(shown="object")),
+        draw_sheet(images, [1, 2, 3], [0] * 3, "counts"),
+    )
+    np.testing.assert_array_equal(drawn.totals, whole.totals)
+    assert drawn.window == whole.window and drawn.share == (1 - 2 * cut / size,) * 2 and not drawn.half
+
+
+@pytest.mark.parametrize("value", [0.0, 1.0, np.nan])
+def test_images_without_an_object_are_shown_whole(value):
+    images = np.full((2, 30, 40), value, np.float32)
+    assert Display(shown="object").part(images, in_mosaic=True).shape == images.shape
+
+
+def test_a_unit_of_length_stays_with_its_number():
+    lines = wrap_text("CGLS, 3 iterations, 128 x 128 x 128 voxels of 1.17 mm", lambda text: len(text) <= 50)
+    assert lines == ["CGLS, 3 iterations, 128 x 128 x 128 voxels of", "1.17 mm"]
+    assert wrap_text("", lambda text: False) == [""]
+
+
 def test_images_too_small_for_a_total_have_none():
-    images = np.zeros((2, 64, 64), np.float32)
+    images = np.zeros((2, 24, 100), np.float32)
     images[0, 20, 20] = 123456.0
     drawn = draw_sheet(images, [1, 2], [0, 0], "counts")
     (row, column) = drawn.corners[1]
-    assert not (drawn.picture[row + 20 : row + 64, column : column + 64] == 255).any()
+    assert not (drawn.picture[row + 16 : row + 24, column : column + 100] == 255).any()
 
 
 def test_a_run_without_counts_can_be_shown(tmp_path):

@@ -116,6 +116,17 @@ def test_noise_resolves_hardly_any_sector(kind, volumes):
     assert volumes < 200 or resolved[small].mean() <= 0.008
 
 
+@pytest.mark.parametrize(("flat", "light"), [(0.2, "green"), (0.4, "amber")])
+def test_rods_are_resolved_slice_by_slice(flat, light):
+    """A part of the rods' middle half shows none; means over all of it still have a valley."""
+    rods = PHANTOM.voxelize(mph.Grid.centered((60, 60, 50), (1.0, 1.0, 0.4)))
+    array = rods.array.copy()
+    array[:, :, 12 : 12 + round(25 * flat)] = PHANTOM.activity / 3
+    for sector in mph.derenzo_score(mph.Volume(array, rods.grid), PHANTOM)[:5]:
+        assert sector.valley_to_peak < 0.735 and sector.chance < 0.001 and sector.light == light
+        assert sector.slices_resolved == pytest.approx(1 - flat, abs=0.06)
+
+
 def test_pairs_by_themselves_prove_nothing():
     """In noise many pairs are below Rayleigh's limit, in some sectors nearly all, and whole sectors: that resolves none."""
     rng, grid = np.random.default_rng(5), mph.Grid.centered((31, 31, 9), 2.0)

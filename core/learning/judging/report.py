@@ -7,10 +7,11 @@ from typing import Any
 import numpy as np
 
 from ...figures.page import Page
-from ...figures.parts import FAINT, INK, Axes, heading, number
+from ...figures.parts import FAINT, INK, Axes, heading
 from ...files import write_bytes
 from ...reconstruction.scores.summary import JUDGED_SCORES
 from ...runs.display import Display
+from ...runs.display import number_text as number
 from ...volumes.volume import Volume
 from .records import write_json
 

@@ -18,14 +18,15 @@ from ..volumes.volume import LINE_INTEGRALS, Volume, require_quantity
 
 _LEVELS = (4, 2, 1)
 """Block sizes, pixels, by which images are compared: coarse ones come first, to find motion that is larger than details."""
-_MAX_DISTANCE = 1.0
-"""Distance in voxels from the motion at which derivatives were computed, beyond which they are computed anew."""
+_MAX_DISTANCE = 0.1
+"""Distance from the motion at which derivatives were computed, in voxels and pixels of a block, beyond which they are
+computed anew: older ones add a bias, of blur and edges that are fitted where they no longer are."""
 _SMOOTHING = 2.0
 """Standard deviation, pixels, of the Gaussian that smooths the derivatives by which residuals are weighted.
 
 Details that voxels cannot hold then say little of the motion.
 """
-_RAYS = 2
+_RAYS = 4
 """Rays per row and column of a pixel by which images are compared without blocks: one tells little of the pixel's mean."""
 _REGIONS = 8
 """Regions per row and column of an image, within which residuals may be correlated, as those of voxels' errors are."""
@@ -75,9 +76,8 @@ class Motion:
 class MotionFinder:
     """Finds the motions of a body since a reference from successive sets of images, for motion as it happens.
 
-    Images are nearly linear in a motion of less than a voxel, so the derivatives of the set before are kept as long as they
-    are valid. Then a motion takes two or three projections, else 14 more for each block size. Parameters are those of
-    `find_motion`.
+    Images are nearly linear in a motion of a tenth of a voxel, so the derivatives of the set before are kept within it. Then
+    a motion takes two or three projections, else 14 more for each block size. Parameters are those of `find_motion`.
     """
 
     def __init__(
@@ -140,7 +140,7 @@ class MotionFinder:
         within a pixel, which are fitted besides, since at sharp edges they are like motion.
         """
         computed_at, *derivatives = self._derivatives_at.get(level, (np.full(6, np.inf),) * 3)
-        if np.abs((motion - computed_at) / self._steps).max() > _MAX_DISTANCE:
+        if np.abs((motion - computed_at) / self._steps).max() > _MAX_DISTANCE * level:
             ends = [[self._project(motion + sign * step, level) for sign in (1, -1)] for step in np.diag(self._steps)]
             slopes = np.gradient(self._project(motion, level), axis=(1, 2))
             images = [(upper - lower) / 2 for upper, lower in ends]

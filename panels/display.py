@@ -26,7 +26,7 @@ class _DisplayPanel:
             row = column.row(align=True)
             row.prop(settings, name, text=text)
             row.operator("mphdrr.pick_window", text="", icon="EYEDROPPER").end = name.upper()
-        column.prop(settings, "shown")
+        column.prop(settings, "region")
         if settings.problem:
             layout.label(text=settings.problem, icon="ERROR")
         _draw_totals(layout, context)

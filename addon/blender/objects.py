@@ -182,12 +182,12 @@ def picture_empty(name: str, parent: bpy.types.Object, picture: bpy.types.Image 
 
 
 def hide(*items: bpy.types.Object | None) -> list[int]:
-    """Hide objects by the eye beside their names and return the `session_uid` of those that were shown."""
+    """Hide objects by the eye beside their names and return the `session_uid` of those that were visible."""
     layer = bpy.context.view_layer
-    shown = [item for item in items if item is not None and item.name in layer.objects and not item.hide_get()]
-    for item in shown:
+    visible_items = [item for item in items if item is not None and item.name in layer.objects and not item.hide_get()]
+    for item in visible_items:
         item.hide_set(True)
-    return [item.session_uid for item in shown]
+    return [item.session_uid for item in visible_items]
 
 
 def change(owner: Any, **values: Any) -> None:

@@ -119,7 +119,7 @@ def figure_job(
         if make_surface is None or subject.volume is None:
             return subject, None
         share = 0 if kind.motion else _READING
-        return subject, make_surface(subject.volume, lambda done, total: progress(share * done // total, _PERCENT))
+        return subject, make_surface(subject.volume, lambda n_done, total: progress(share * n_done // total, _PERCENT))
 
     reel = Reel()
 
@@ -220,12 +220,10 @@ def _label(stage: FigureScene, page: Page) -> None:
     page.line([(start, row), (end, row)], page.ink, 0.25 * em)
     page.text(f"{length:g} mm", (start + end) / 2, row - 0.6 * em, em, page.ink, "middle")
     if surface is not None:
-        left, height = (
-            page.width - _bar_room(page, surface) + round(em),
-            min(round(16 * em), stage.size[1] - round(5 * em)),
-        )
+        column = page.width - _bar_room(page, surface) + round(em)
+        height = min(round(16 * em), stage.size[1] - round(5 * em))
         top = page.height - (stage.size[1] + height) // 2
-        color_bar(page, surface.display, surface.window, surface.unit, left, top, height)
+        color_bar(page, surface.display, surface.window, surface.unit, column, top, height)
 
 
 def _volume_item(context: bpy.types.Context) -> bpy.types.Object | None:

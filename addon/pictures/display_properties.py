@@ -12,7 +12,7 @@ _SCALE_TEXTS = {
     "sqrt": ("Square Root", "Small numbers are told apart better; noise of counts looks the same everywhere"),
     "log": ("Logarithmic", "Colours in proportion to the numbers' logarithms, over three decades unless typed"),
 }
-_PARTS = choices.items({}, (
+_REGIONS = choices.items({}, (
     ("OBJECT", "Object", "In the mosaic the part around the middle that holds what is seen, elsewhere whole images"),
     ("HALF", "Central Half", "The middle half of each image, often called FOV"),
     ("WHOLE", "Whole Images", "All of each image, the wide FOV"),
@@ -25,9 +25,9 @@ _PLANES = (
 )
 
 
-def _show_part(self: bpy.types.PropertyGroup, number: int) -> None:
-    """Show the part of this number."""
-    self.half, self.whole = (number == part[3] for part in _PARTS[1:])
+def _show_region(self: bpy.types.PropertyGroup, number: int) -> None:
+    """Show the region of this number."""
+    self.half, self.is_whole = (number == part[3] for part in _REGIONS[1:])
 
 
 class DisplayProperties(bpy.types.PropertyGroup):
@@ -46,11 +46,11 @@ class DisplayProperties(bpy.types.PropertyGroup):
     high: FloatProperty(
         name="High", description="Number with the last colour", default=1.0, update=updates.on_edit("display")
     )
-    shown: EnumProperty(name="Show", description="Part of each image that the pictures show; the exact images stay whole",
-                        items=_PARTS, get=lambda self: _PARTS[1 if self.half else 2 * self.whole][3],
-                        set=_show_part)  # fmt: skip
+    region: EnumProperty(name="Show", description="Part of each image that the pictures show; the exact images stay whole",
+                        items=_REGIONS, get=lambda self: _REGIONS[1 if self.half else 2 * self.is_whole][3],
+                        set=_show_region)  # fmt: skip
     half: BoolProperty(name="Central Half", options={"HIDDEN"}, update=updates.on_edit("display"))
-    whole: BoolProperty(name="Whole Images", options={"HIDDEN"}, update=updates.on_edit("display"))
+    is_whole: BoolProperty(name="Whole Images", options={"HIDDEN"}, update=updates.on_edit("display"))
     planes: EnumProperty(name="Planes", description="Modules whose projections stand in the scene",
                          items=choices.items({}, _PLANES), default="ALL", update=updates.on_edit("planes"))  # fmt: skip
     plane_distance: FloatProperty(name="Distance",
@@ -83,7 +83,7 @@ class DisplayProperties(bpy.types.PropertyGroup):
     def display(self) -> Display:
         """Return the colours, scale, window and shown part; raise `InputError` for an invalid window."""
         low, high = (None, None) if self.automatic else (self.low, self.high)
-        return Display(self.colors.lower(), self.scale.lower(), low, high, self.shown.lower())
+        return Display(self.colors.lower(), self.scale.lower(), low, high, self.region.lower())
 
 
 CLASSES = (DisplayProperties,)

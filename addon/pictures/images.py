@@ -39,7 +39,9 @@ _LABELS = "mphdrr_labels"  # custom property of the mosaic: the label of each ti
 _TILES = "mphdrr_tiles"  # custom property of the mosaic: its modules, its unit, and the position of each tile
 _VIEWS = "mphdrr_views"  # custom property of the mosaic: the run's views, as arrays of `Views`, and their ROI radii
 
-_shown: dict[bpy.types.Area, str] = {}  # names of the pictures that Image Editors showed before an undo or redo
+_names_before_undo: dict[
+    bpy.types.Area, str
+] = {}  # names of the pictures that Image Editors showed before an undo or redo
 
 
 @dataclass(frozen=True)
@@ -169,8 +171,8 @@ def mosaic_views(mosaic: bpy.types.Image) -> tuple[Views, NDArray[np.float64]] |
 
 def shown_fraction() -> tuple[float, float]:
     """Return the fractions of the exact images' width and height that their pictures, but for the mosaic, show."""
-    shown = tiles(bpy.data.images.get(ids.MOSAIC)) or {}
-    x, y = shown["share"] if shown.get("half") else (1.0, 1.0)
+    mosaic_tiles = tiles(bpy.data.images.get(ids.MOSAIC)) or {}
+    x, y = mosaic_tiles["share"] if mosaic_tiles.get("half") else (1.0, 1.0)
     return x, y
 
 
@@ -330,13 +332,13 @@ def _editors(context: bpy.types.Context) -> list[tuple[bpy.types.Window, bpy.typ
 def before_undo(*_: Any) -> None:
     """Note the pictures in the free Image Editors: those whose image an undo or redo makes anew would show none."""
     pictures = ((area, area.spaces.active.image) for _, area in _editors(bpy.context))
-    _shown.update({area: image.name for area, image in pictures if image is not None})
+    _names_before_undo.update({area: image.name for area, image in pictures if image is not None})
 
 
 def after_undo(*_: Any) -> None:
     """Show pictures again in the editors that had them, when an undo or redo has brought them back."""
     for window, area in _editors(bpy.context):
-        image = bpy.data.images.get(_shown.get(area, ""))
+        image = bpy.data.images.get(_names_before_undo.get(area, ""))
         if image not in (None, area.spaces.active.image):
             area.spaces.active.image = image
             _fit(window, area)

@@ -41,6 +41,7 @@ from ..volumes import looks, slices, stored_volumes, volumes
 
 _MIN_INTERVAL = 2.0  # s between two pictures of a running reconstruction
 _PNG_LEVEL = 1  # fast compression
+_SURFACE = 0.4  # value of the rods' surface, as a share of the display range, which begins at 0
 _TEXT = 14.0  # size of text in a picture that fills an editor, pixels at a resolution scale of 1
 MORE_ITERATIONS = 10
 """Number of iterations that Continue does."""
@@ -210,6 +211,7 @@ class _LiveResult:
             self._item = item.session_uid
             if item.mphdrr_volume.quantity == "activity":
                 item.mphdrr_volume.look = "SHELL"
+                item.mphdrr_volume.surface = _SURFACE * item.mphdrr_volume.display_high
         else:
             volumes.replace_stored(item, state.stored)
         if state.window[0] < state.window[1]:

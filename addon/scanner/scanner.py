@@ -329,8 +329,9 @@ def suggested_ranges(settings: Any, context: bpy.types.Context, text: str) -> li
 def visible_modules(settings: bpy.types.PropertyGroup) -> str:
     """Return the numbers of the visible modules of the scene's scanner, such as "1-40, 45"; "" if all are visible."""
     cameras_ = _active_modules(settings.id_data)
-    shown = [not camera.hide_viewport for camera in cameras_]
-    return "" if all(shown) else numbers_text([o.mphdrr_module.number for o in cameras_], shown) or "none"
+    are_visible = [not camera.hide_viewport for camera in cameras_]
+    numbers = [camera.mphdrr_module.number for camera in cameras_]
+    return "" if all(are_visible) else numbers_text(numbers, are_visible) or "none"
 
 
 def show_visible_modules(settings: bpy.types.PropertyGroup, text: str) -> None:
@@ -349,8 +350,8 @@ def show_modules(collection: bpy.types.Collection, text: str = "", mode: str = "
     """
     cameras_ = modules(collection)
     numbers = np.array([camera.mphdrr_module.number for camera in cameras_] or [0])
-    wanted = numbers[chosen_indices(numbers, text if text and mode != "ALL" else "-", "modules")]
-    chosen = {camera for camera in cameras_ if camera.mphdrr_module.number in wanted}
+    chosen_numbers = numbers[chosen_indices(numbers, text if text and mode != "ALL" else "-", "modules")]
+    chosen = {camera for camera in cameras_ if camera.mphdrr_module.number in chosen_numbers}
     for camera, parts in following.parts_of(collection, cameras_).items():
         if camera in chosen or mode == "ONLY":
             _set_hidden([camera, *parts], mode == "HIDE" or camera not in chosen)

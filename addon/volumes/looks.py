@@ -16,7 +16,7 @@ from . import vdb, volume_materials, volumes
 _KEY = "mphdrr_surface"  # custom property of a surface's object: its number among those of its volume, from 1
 # Exponent and gain of the extinction; looks without an entry draw a surface instead of smoke.
 _SMOKE = {"DENSITY": (1.0, 1.0), "BRIGHTEST": (3.0, 0.4)}
-_SURFACE_SHARE = {"SHELL": 0.4, "CUT": 0.1}  # the surface's value as a fraction of the display range
+_SURFACE_SHARE = {"SHELL": 0.6, "CUT": 0.1}  # the surface's value as a fraction of the display range
 _TISSUES = {  # low and high end of the display range and the surface's value, HU; the surface's linear RGB
     "BONE": ((-160.0, 240.0, 250.0), (0.85, 0.76, 0.58)),
     "SOFT": ((-160.0, 240.0, -160.0), (0.72, 0.42, 0.30)),

@@ -21,7 +21,7 @@ def _draw(page: Page, subject: FigureSubject, wide: bool) -> None:
     assert run is not None
     system = subject.select_modules(run.system)
     images = run.projections[np.isin(run.system.numbers, system.numbers)]
-    images = replace(subject.display, shown="whole" if wide else "half").part(images)
+    images = replace(subject.display, region="whole" if wide else "half").part(images)
     rows, columns = images.shape[1:]
     contents = "Wide FOV: whole images" if wide else "FOV: the central half of each image"
     suffix = f" of {subject.name}" if subject.name else ""

@@ -69,5 +69,5 @@ def _parts(sigma: float, hole: float, voxel: float, is_by_depth: bool) -> int:
     misplaced = sharp * (1 + voxel / (3 * sigma)) ** -0.55 - 0.5
     widened = 1.0 if is_narrow else (15 / (width**0.5 * variance)) ** 0.4
     least = min(max(math.ceil(max(misplaced, widened)), 2 if sigma < 0.7 and not is_narrow else 1), 10)
-    more = range(least, 2 * least + 1) if is_by_depth and least > 1 and sigma * least > _WIDE else ()
-    return next((n for n in more if _includes_spline(sigma * n, hole * n)), least)
+    counts = range(least, 2 * least + 1) if is_by_depth and least > 1 and sigma * least > _WIDE else ()
+    return next((n for n in counts if _includes_spline(sigma * n, hole * n)), least)

@@ -32,7 +32,7 @@ _PLAIN_DIGITS = 5
 """Digits before the decimal point up to which a number is written without a power of ten."""
 SCALES = ("linear", "sqrt", "log")
 PARTS = ("object", "half", "whole")
-"""Parts of images that can be shown, see `Display.shown`."""
+"""Parts of images that can be shown, see `Display.region`."""
 _FAINT = 0.02
 """Sum of a row or column, relative to the largest of all images, up to which it does not count as the object's."""
 _MARGIN = 0.03
@@ -56,7 +56,7 @@ class Display:
     """Number with the first colour; None for an automatic one."""
     high: float | None = None
     """Number with the last colour; None for the largest number."""
-    shown: str = "whole"
+    region: str = "whole"
     """Part of each image around its middle, a name of `PARTS`: the "whole" image, which users call the wide FOV; its middle
     "half", the FOV; or, in a mosaic, as many eighths of both sides as hold the "object" in all images, with a margin."""
 
@@ -64,7 +64,7 @@ class Display:
         if self.colors not in _COLORS:
             raise InputError(f"colors {self.colors!r}: expected one of {', '.join(COLORS)}")
         one_of(self.scale, SCALES, "scale")
-        one_of(self.shown, PARTS, "shown")
+        one_of(self.region, PARTS, "region")
         for name, value in (("low", self.low), ("high", self.high)):
             if value is not None and not np.isfinite(value):
                 raise InputError(f"{name} = {value}: expected a finite number")
@@ -75,10 +75,10 @@ class Display:
 
     def part(self, images: Floats32, in_mosaic: bool = False) -> Floats32:
         """Return the part of images (..., n_v, n_u) that is shown, the same of all images."""
-        fits = in_mosaic and self.shown == "object"
-        eighths = 4 if self.shown == "half" else _eighths_of_object(images) if fits else 8
-        top, left = (n * (8 - eighths) // 16 for n in images.shape[-2:])
-        return images[..., top : images.shape[-2] - top, left : images.shape[-1] - left]
+        fits = in_mosaic and self.region == "object"
+        eighths = 4 if self.region == "half" else _eighths_of_object(images) if fits else 8
+        rows, columns = (slice(cut, n - cut) for n in images.shape[-2:] for cut in [n * (8 - eighths) // 16])
+        return images[..., rows, columns]
 
     def window(self, values: ArrayLike) -> tuple[float, float]:
         """Return the numbers with the first and the last colour if `values` are shown."""

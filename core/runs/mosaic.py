@@ -143,7 +143,7 @@ def draw_sheet(
     with_bar = np.concatenate([picture, bar], axis=1)
     share = visible.shape[2] / projections.shape[2], visible.shape[1] / projections.shape[1]
     maxima = counted.max(axis=(1, 2))
-    return MosaicSheet(with_bar, corners, (n_v, n_u), window, word, values, maxima, display.shown == "half", share)
+    return MosaicSheet(with_bar, corners, (n_v, n_u), window, word, values, maxima, display.region == "half", share)
 
 
 def write_sheet(run: "ProjectionRun", path: AnyPath, display: Display | None = None) -> None:

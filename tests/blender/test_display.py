@@ -95,8 +95,8 @@ def test_a_readout_names_the_pixel_whose_colour_is_under_the_pointer(projected, 
     """Whatever part the tiles show: the number has the colour of the place, and the pixel is within the part."""
     projected()
     settings, mosaic = scene.mphdrr_display, bpy.data.images[ids.MOSAIC]
-    settings.shown = part
-    assert settings.shown == part and (settings.half, settings.whole) == (part == "HALF", part == "WHOLE")
+    settings.region = part
+    assert settings.region == part and (settings.half, settings.is_whole) == (part == "HALF", part == "WHOLE")
     shown, picture, rng = images.tiles(mosaic), pixels(mosaic)[::-1, :, :3], np.random.default_rng(2)
     display, rows, columns = settings.display(), set(), set()
     for corner in np.reshape(shown["corners"], (-1, 2)):
@@ -114,17 +114,17 @@ def test_a_readout_names_the_pixel_whose_colour_is_under_the_pointer(projected, 
 
 def test_the_part_that_an_earlier_file_or_a_script_sets_is_the_one_in_the_panel(scene):
     settings = scene.mphdrr_display
-    assert settings.shown == "OBJECT"
+    assert settings.region == "OBJECT"
     settings.half = True
-    assert settings.shown == "HALF" and settings.display().shown == "half"
-    settings.shown = "OBJECT"
-    assert not settings.half and settings.display().shown == "object"
+    assert settings.region == "HALF" and settings.display().region == "half"
+    settings.region = "OBJECT"
+    assert not settings.half and settings.display().region == "object"
 
 
 def test_a_number_picked_from_a_picture_is_the_exact_one_and_becomes_an_end_of_the_window(projected, scene):
     projected()
     settings, mosaic = scene.mphdrr_display, bpy.data.images[ids.MOSAIC]
-    settings.shown = "WHOLE"
+    settings.region = "WHOLE"
     shown = images.tiles(mosaic)
     exact = images.projection_array(bpy.data.images[ids.projection_name(5, 8)])
     row, column = np.unravel_index(exact.argmax(), exact.shape)
@@ -318,7 +318,7 @@ def test_the_newest_display_wins_and_no_earlier_run_is_painted(projected, scene,
     projected(width=20, height=20)
     for _ in steps:
         assert images.projection_array(bpy.data.images[ids.projection_name(8, 8)]).shape == (20, 20)
-    assert shows(Display("grey", shown="object"))
+    assert shows(Display("grey", region="object"))
     scene.mphdrr_display.colors = "MAGMA"
     steps = recoloring.recoloring()
     while images.tiles(bpy.data.images[ids.MOSAIC])["display"] != "None":  # until the mosaic is made
@@ -326,8 +326,8 @@ def test_the_newest_display_wins_and_no_earlier_run_is_painted(projected, scene,
     scene.mphdrr_display.scale = "LOG"
     for _ in steps:
         pass
-    assert shows(Display("magma", "log", shown="object"))
+    assert shows(Display("magma", "log", region="object"))
     scene.mphdrr_display.colors = "VIRIDIS"
-    assert not shows(Display("viridis", "log", shown="object"))
+    assert not shows(Display("viridis", "log", region="object"))
     recoloring.check()  # as after an undo
-    assert shows(Display("viridis", "log", shown="object"))
+    assert shows(Display("viridis", "log", region="object"))

@@ -104,7 +104,7 @@ DEFAULTS = {
     "model": "TRANSMISSION",
     "isotope": "NONE", "aperture_material": "NUMBER", "edge": "PAIX", "crystal_material": "NUMBER",
     "detector": "VIRTUAL", "backend": "AUTO", "rows": "BY_NUMBER", "unit": "NONE",
-    "colors": "INFERNO", "scale": "LINEAR", "shown": "OBJECT", "planes": "ALL", "look": "DENSITY", "figure": "SCANNER",
+    "colors": "INFERNO", "scale": "LINEAR", "region": "OBJECT", "planes": "ALL", "look": "DENSITY", "figure": "SCANNER",
     "method": "OSEM", "prior": "NONE", "hole": "AUTO", "lines": "TOGETHER", "dead_time_kind": "NON_PARALYSABLE",
     "panel": "COUNTING", "sensor": "NONE", "materials": "WATER_BONE",
     "how": "SUM", "uniform": "K", "MixturePhantomProperties.look": "solids",

@@ -65,7 +65,7 @@ def test_numbers_outside_a_window_have_its_ends_colours_and_no_number_has_the_fi
     [
         ({"colors": "jet"}, "colors 'jet': expected one of inferno"),
         ({"scale": "cube"}, "scale 'cube': expected one of linear"),
-        ({"shown": "all"}, "shown 'all': expected one of object, half, whole"),
+        ({"region": "all"}, "region 'all': expected one of object, half, whole"),
         ({"low": 3, "high": 3}, "expected low to be less than high"),
         ({"scale": "log", "low": 0}, "expected more than 0 on the logarithmic scale"),
         ({"high": np.inf}, "expected a finite number"),
@@ -153,7 +153,7 @@ def test_the_central_half_is_shown_with_its_own_totals_in_the_window_of_all(shap
     images[0, 0, 0] = 50.0
     n_v, n_u = shape
     middle = images[:, n_v // 4 : n_v - n_v // 4, n_u // 4 : n_u - n_u // 4]
-    display = Display(shown="half")
+    display = Display(region="half")
     assert np.array_equal(display.part(images), middle)
     assert np.array_equal(display.part(images[:, ::-1, ::-1]), middle[:, ::-1, ::-1]), "seen from any side"
     drawn, own = draw_sheet(images, [1, 2], [0, 0], "counts", display), Display(high=50.0)
@@ -172,11 +172,11 @@ def test_the_object_fills_the_tiles_and_is_whole_in_all_of_them(size, reach, eig
     images = rng.poisson(0.001, (3, size, size)).astype(np.float32) / 10
     images[:, size // 2 - 4 : size // 2 + 4, size // 2 - 4 : size // 2 + 4] = 1.0
     images[1, size // 2 - reach : size // 2, size // 2 - 3 : size // 2 + 3] = 1.0
-    shown = Display(shown="object").part(images, in_mosaic=True)
+    shown = Display(region="object").part(images, in_mosaic=True)
     cut = size * (8 - eighths) // 16
     assert np.array_equal(shown, images[:, cut : size - cut, cut : size - cut])
     drawn, whole = (
-        draw_sheet(images, [1, 2, 3], [0] * 3, "counts", Display(shown="object")),
+        draw_sheet(images, [1, 2, 3], [0] * 3, "counts", Display(region="object")),
         draw_sheet(images, [1, 2, 3], [0] * 3, "counts"),
     )
     np.testing.assert_array_equal(drawn.totals, whole.totals)
@@ -186,7 +186,7 @@ def test_the_object_fills_the_tiles_and_is_whole_in_all_of_them(size, reach, eig
 @pytest.mark.parametrize("value", [0.0, 1.0, np.nan])
 def test_images_without_an_object_are_shown_whole(value):
     images = np.full((2, 30, 40), value, np.float32)
-    assert Display(shown="object").part(images, in_mosaic=True).shape == images.shape
+    assert Display(region="object").part(images, in_mosaic=True).shape == images.shape
 
 
 def test_a_unit_of_length_stays_with_its_number():

@@ -60,9 +60,9 @@ def surface_maker(item: bpy.types.Object) -> Callable[[Volume, Progress], Surfac
     """
     settings, factor = item.mphdrr_volume, volume_materials.display_unit(item.mphdrr_volume.quantity)[1]
     window, unit, name = (settings.display_low, settings.display_high), settings.unit, item.name
-    display, is_surface = Ramp(ramp=volume_materials.item_ramp(item, smoke=True)), bool(looks.surfaces_of(item))
-    chosen_level = settings.surface if is_surface else window[0] + _LEVEL * (window[1] - window[0])
-    cut = list(settings.slices) if is_surface and slices.planes_of(item) else None
+    display, n_surfaces = Ramp(ramp=volume_materials.item_ramp(item, smoke=True)), len(looks.surfaces_of(item))
+    chosen_level = settings.surface if n_surfaces else window[0] + _LEVEL * (window[1] - window[0])
+    cut = list(settings.slices) if n_surfaces == 1 and slices.planes_of(item) else None  # bones stand whole in the skin
 
     def make(volume: Volume, progress: Progress) -> Surface:
         """Return the surface of a volume in world mm."""

@@ -20,7 +20,7 @@ from mphdrr.addon.cli.scene import save_scene
 from mphdrr.addon.figures import engine, figures, studio, surfaces
 from mphdrr.addon.runs import rendering
 from mphdrr.addon.scanner import scanner, selection
-from mphdrr.addon.volumes import volumes
+from mphdrr.addon.volumes import slices, volumes
 from mphdrr.core.figures.kinds import KINDS
 from mphdrr.core.figures.page import Page
 from mphdrr.core.figures.parts import heading_height
@@ -325,6 +325,19 @@ def test_a_surface_lies_at_its_value_and_has_the_colours_of_what_it_encloses(sce
         assert np.abs(radii - 8 * (1 - surface.level / peak)).max() < 0.6, "mm, of a quarter of the voxels' size"
         true_color = surface.display.colored(volume.array[grid_index(grid, center)], surface.window)
         assert np.abs(surface.colors[half].astype(int) - true_color).max() <= 24, "a step of the palette in 16"
+
+
+def test_bones_are_whole_in_pictures_as_in_the_window(scene):
+    """Their look has slices, at which the window cuts the skin around them open."""
+    grid = mph.Grid.centered(40, 2.0)
+    distances = np.linalg.norm((np.indices(grid.shape).reshape(3, -1).T - 19.5) * 2.0, axis=1).reshape(grid.shape)
+    hu = np.where(distances < 30, np.clip(1000 - 40 * distances, 40, None), -1000.0)  # 250 HU at 18.75 mm
+    volume = mph.Volume(hu.astype(np.float32), grid, "hu")
+    item = volumes.add_volume(volume, "CT")
+    assert item.mphdrr_volume.look == "BONE" and slices.planes_of(item)
+    vertices = surfaces.surface_maker(item)(volume, lambda *step: None).mesh.vertices
+    assert np.abs(np.linalg.norm(vertices, axis=1) - 18.75).max() < 0.2, "all of the bone's surface, and nothing else"
+    assert (vertices.min(axis=0) < -18).all() and (vertices.max(axis=0) > 18).all()
 
 
 def grid_index(grid: mph.Grid, point: np.ndarray) -> tuple[int, ...]:

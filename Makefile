@@ -1,6 +1,6 @@
 # make demo    the whole main path on the real workbook, into out/
 # make test    linters, types and tests (tests/core, tests/blender, tests/field); TESTS=--once: laws of numbers in one case each
-# make test-long   the tests that take minutes: long property runs, workbooks through LibreOffice
+# make test-long   the tests that take minutes: long property runs, workbooks through LibreOffice; TESTS=--once as above
 # make bench   speed, accuracy and memory beside other projectors, into docs/; BENCH=--quick: a minute or two, into out/
 # make bench-events   event sets beside the usual pipeline with DiffDRR, into docs/; BENCH=--quick: a minute, into out/
 # make bench-all   these and others beside all peers in one run, table and picture at the top of docs/benchmarks.md; wants
@@ -58,7 +58,7 @@ test: lint
 	$(PYTESTS) $(TESTS)
 
 test-long: env-dev
-	$(PYTESTS) -m long
+	$(PYTESTS) -m long $(TESTS)
 
 lint: env-dev
 	@$(BIN)/ruff check -q

@@ -94,8 +94,8 @@ def test_it_ends_at_the_optimum(small, prior):
 
 
 @pytest.mark.long
-def test_it_ends_at_the_optimum_of_24_voxels_a_side(scanner):
-    problem = make(scanner, 24, 24, 4)
+def test_it_ends_at_the_optimum_of_16_voxels_a_side(scanner):
+    problem = make(scanner, 16, 16, 4)
     found, best = compare_with_optimum(problem, mph.RelativeDifference(1.0), 5, 150)
     assert np.linalg.norm(found.volume.array - best) <= 1e-4 * np.linalg.norm(best)
 

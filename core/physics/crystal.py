@@ -70,7 +70,7 @@ def gaussian_blur(n: int, sigma: float, parts: int = 1, blurred: float = 0.0) ->
     squares = np.arange(-reach, reach + 1) ** 2
     kernel = np.exp(-0.5 * squares / max(width, 1e-3) ** 2)
     kernel /= kernel.sum()
-    missing = max(width**2 - squares @ kernel, 0.0) / 2
+    missing = max(width**2 - float(squares @ kernel), 0.0) / 2
     return _blur(n, sigma, parts, np.convolve(kernel, [missing, 1 - 2 * missing, missing]))
 
 

@@ -138,7 +138,7 @@ DISTANCES = "distances = [[1, 2, 51.96], [2, 3, 84.85]]"
 
 def stop_training(patch: pytest.MonkeyPatch) -> None:
     """Let a training stop where it would make its samples, with trainer and network made."""
-    from mphdrr.core.learning import training
+    from mphdrr.core.learning import recipe, training
     from mphdrr.core.learning.data import Samples
     from mphdrr.core.learning.networks import NETWORKS
 
@@ -146,6 +146,7 @@ def stop_training(patch: pytest.MonkeyPatch) -> None:
 
     for name in ("toy", "after-osem"):  # the latter is the default, which takes long to make
         patch.setitem(NETWORKS, name, TOY)  # type: ignore[arg-type]
+    patch.setattr(recipe, "network_settings", recipe.network_settings.__wrapped__)  # or the toy's outlive this test
 
     def samples(source: Any, folder: Path, splits: Iterable[str], *_: object) -> list[Any]:
         assert source.size > 0  # refuses what memory cannot hold

@@ -22,7 +22,7 @@ from .scene import INSTALL_BLENDER, new_scene, quiet, save_scene
 
 _FIGURES = {"phantom": "picture", "cut-away": "cut-away", "sums": "sums"}
 """Kinds of the figures by name, besides those of the modules' ranges."""
-_SIZE = dict.fromkeys(("scanner", "picture", "cut-away"), (880, 510))
+_SIZE = dict.fromkeys(("scanner", "picture", "cut-away"), (720, 420))
 """Sizes of figures, pixels; smaller than usual, since figures take most of the demo's time."""
 
 

@@ -72,7 +72,7 @@ def compiled(name: str, folder: str | Path, flags: tuple[str, ...] = FLAGS) -> l
     calls: list[tuple[str, str, tuple[str, ...]]] = [("levels.o", "levels.c", ())]
     for level, options in enumerate(made_for.levels):
         for real in ("float", "double"):
-            for source in ("siddon", "depth", "places"):
+            for source in ("siddon", "depth", "places", *(["photons"] if real == "float" else [])):
                 made = f"{source}_{real}{level}.o"
                 calls.append((made, f"{source}.c", (*options, f"-DLEVEL={level}", f"-DREAL={real}")))
 

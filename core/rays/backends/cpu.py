@@ -9,7 +9,7 @@ in float64, all others in float32. The same library has the kernels of `pinhole_
 import ctypes
 import os
 import sys
-from ctypes import POINTER, Structure, c_char_p, c_double, c_int64, c_void_p
+from ctypes import POINTER, Structure, c_char_p, c_double, c_int64, c_uint64, c_void_p
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +23,7 @@ from ..ray_geometry import Attenuation, IndexFans, IndexRays, Rays
 LEVEL_VARIABLE = "MPHDRR_CPU_LEVEL"
 """Environment variable with the name of a lower level of processor, of `levels`, than this one's."""
 
-_CONTRACT = 10
+_CONTRACT = 11
 _NAMES = {"win32": "siddon.dll", "darwin": "libsiddon.dylib"}
 _MAX_VOXELS = 2**31 - 1  # their indices have 32 bits
 _PRODUCT = 2  # in kernels.h
@@ -85,11 +85,37 @@ class PlacesJob(Structure):
     ]  # fmt: skip
 
 
+class PhotonJob(Structure):
+    """A job of photons that scatter, as kernels.h has it."""
+
+    _fields_ = [
+        ("is_double", c_int64), ("body", c_void_p), ("n", c_int64 * 3), ("index_from_world", c_double * 12),
+        ("energies", c_int64), ("lowest", c_double), ("energies_per_kev", c_double), ("coefficients", c_void_p),
+        ("momenta", c_int64), ("momenta_per_root", c_double), ("incoherent", c_void_p), ("coherent", c_void_p),
+        ("coherent_until", c_void_p), ("activity_until", c_void_p), ("source_voxels", c_void_p), ("sources", c_int64),
+        ("source_n", c_int64 * 3), ("world_from_source", c_double * 12), ("lines", c_void_p), ("n_lines", c_int64),
+        ("seed", c_uint64), ("first", c_int64), ("last", c_int64), ("all_first", c_int64), ("histories", c_int64),
+        ("collisions", c_void_p), ("capacity", c_int64), ("followed", c_void_p), ("n_collisions", c_void_p), ("holes", c_void_p),
+        ("modules", c_int64), ("first_module", c_int64), ("last_module", c_int64), ("accepted", c_void_p),
+        ("windows", c_int64), ("orders", c_int64), ("cell_of", c_void_p), ("cells", c_int64), ("seen", c_void_p),
+        ("spectra", c_void_p),
+    ]  # fmt: skip
+
+
+MODULE = np.dtype([
+    ("hole", "3f8"), ("u", "3f8"), ("v", "3f8"), ("axis", "3f8"), ("slopes", "4f8"), ("margin", "f8"),
+    ("margin_by_height", "f8"), ("nearest", "f8"), ("area", "f8"),
+    ("least", "f8"),
+])  # fmt: skip
+"""A module that sees photons, as kernels.h has it: `Module`."""
+COLLISION_BYTES, MOST_COLLISIONS = 72, 64  # in kernels.h
+
 _KERNELS = {
     _Job: ("forward", "backproject", "differentiate", "differentiate_by_mu"),
     DepthJob: ("voxels_to_cells", "cells_to_voxels", "cells_to_pixels", "pixels_to_cells",
                "differentiate_places", "differentiate_taps"),
     PlacesJob: ("take_at", "give_at"),
+    PhotonJob: ("follow", "see"),
 }  # fmt: skip
 
 
@@ -99,9 +125,9 @@ def _load() -> ctypes.CDLL:
     if not path.is_file():
         raise ImportError(f"no compiled kernels for this platform: {path.name} is not in {path.parent}")
     library = ctypes.CDLL(str(path))
-    numbers = (c_int64 * 5)()
+    numbers = (c_int64 * 6)()
     library.contract(numbers)
-    sizes = (ctypes.sizeof(_Job), _FAN.itemsize, ctypes.sizeof(DepthJob), ctypes.sizeof(PlacesJob))
+    sizes = (ctypes.sizeof(_Job), _FAN.itemsize, *map(ctypes.sizeof, (DepthJob, PlacesJob, PhotonJob)))
     if tuple(numbers) != (_CONTRACT, *sizes):
         raise ImportError(f"{path} belongs to another version of mphDRR: install it anew")
     library.best_level.restype, library.level_name.restype = c_int64, c_char_p

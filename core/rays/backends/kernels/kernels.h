@@ -18,7 +18,7 @@
 
 #define NODE_ROWS 4
 #define GIVEN_ROWS 16
-#define CONTRACT 10 // increased with every change of the code of this file: cpu.py refuses any other
+#define CONTRACT 11 // increased with every change of the code of this file: cpu.py refuses any other
 
 // Voxels (n[0], n[1], n[2]) in C order, float or double as the job says.
 typedef struct {
@@ -127,12 +127,67 @@ typedef struct {
     int32_t *exponents; // of the points' shape, with PRODUCT: a point's product is its number times 2 to this power
 } PlacesJob;
 
+// Photons that scatter in a body. World points and lengths are in mm, energies in keV. A voxel of the body holds the densities of its
+// materials, each as a share of the material's own. Tables by energy have `energies` numbers, from `lowest` on; those by the momentum
+// transfer x, 1/angstrom, have `momenta` numbers at even steps of sqrt(x).
+#define MATERIALS 2
+#define MOST_COLLISIONS 64 // of a history
+
+typedef struct {
+    double place[3], direction[3], energy; // before the collision
+    float weight;                          // photons, of 1 that began
+    int32_t voxel, order;                  // voxel of the body; 1 for the first collision
+} Collision;
+
+typedef struct {
+    double hole[3], u[3], v[3], axis[3]; // the axis points to what is seen
+    double slopes[4];                    // least and largest u / height and v / height of what is seen
+    double margin, margin_by_height;     // mm beside them that are seen, too
+    double nearest;                      // height above the hole's plane from which on places are seen, mm
+    double area;                         // d_e^2 / 16, mm^2
+    double least;                        // photons through the hole, of one history: contributions below play roulette for so many
+} Module;
+
+typedef struct {
+    int64_t is_double; // 0: there are no kernels of double
+    const float *body; // (n[0], n[1], n[2], MATERIALS)
+    int64_t n[3];
+    double index_from_world[3][4]; // voxel i of an axis fills [i, i + 1)
+    int64_t energies;
+    double lowest, energies_per_kev; // photons of less energy are not followed
+    const float *coefficients;       // (3, MATERIALS, energies): total, incoherent and coherent attenuation, 1/mm
+    int64_t momenta;
+    double momenta_per_root;
+    const float *incoherent, *coherent; // (MATERIALS, momenta): r_e^2 / 2 times electrons per mm^3 times S(x), or F(x)^2, 1/mm
+    const float *coherent_until;        // (MATERIALS, momenta): integral of F(x)^2 over x^2 from 0
+    const double *activity_until;       // (sources): shares of the activity before each source, ascending, from 0
+    const int64_t *source_voxels;       // (sources): flat indices of the voxels in source_n
+    int64_t sources, source_n[3];
+    double world_from_source[3][4];     // of the index space in which voxel i fills [i, i + 1)
+    const double *lines; // (2, n_lines): energies, and the shares of the photons up to each line
+    int64_t n_lines;
+    uint64_t seed;
+    int64_t first, last;           // numbers of the histories that are followed
+    int64_t all_first, histories;  // first and number of those over which the activity is spread evenly
+    Collision *collisions;
+    int64_t capacity;                  // at least MOST_COLLISIONS
+    int64_t *followed, *n_collisions;  // results of follow: the first history that had no room, and the number of collisions
+    const Module *holes;               // (modules)
+    int64_t modules, first_module, last_module;
+    const float *accepted;             // (modules, windows, energies): shares of the photons that are counted
+    int64_t windows, orders;
+    const int32_t *cell_of;            // cells of the body's voxels
+    int64_t cells;
+    float *seen;                       // (orders, windows, cells, modules): photons of an even emission that would be seen alike
+    double *spectra;                   // (modules, energies): photons that pass the hole; or null
+} PhotonJob;
+
 // Highest level of kernels that this processor supports; any processor of the platform runs level 0.
 int64_t best_level(void);
 const char *level_name(int64_t level); // null if there is no such level
 
-// CONTRACT, and the sizes in bytes of a Job, a Fan, a DepthJob and a PlacesJob: cpu.py compares them with its own.
-void contract(int64_t numbers[5]);
+// CONTRACT, and the sizes in bytes of a Job, a Fan, a DepthJob, a PlacesJob and a PhotonJob: cpu.py compares them with its own.
+void contract(int64_t numbers[6]);
 
 // values = integrals
 void forward(int64_t level, const Job *job);
@@ -166,3 +221,7 @@ void take_at(int64_t level, const PlacesJob *job);
 
 // the single array += the points' numbers, shared out: the adjoint of the sum in take_at
 void give_at(int64_t level, const PlacesJob *job);
+
+// collisions = those of the histories; and seen += what the modules see of the collisions
+void follow(int64_t level, const PhotonJob *job);
+void see(int64_t level, const PhotonJob *job);

@@ -5,12 +5,14 @@
 // Names of a kernel's versions, level by level, and the thread's mode of floating-point numbers, with denormal numbers as 0.
 #ifdef __x86_64__
 #define EACH(name) name##_0_float, name##_0_double, name##_1_float, name##_1_double, name##_2_float, name##_2_double
+#define EACH_FLOAT(name) name##_0_float, name##_1_float, name##_2_float
 static const char *const names[] = {"SSE2", "AVX2", "AVX-512"};
 #define MODE() __builtin_ia32_stmxcsr()
 #define SET_MODE(mode) __builtin_ia32_ldmxcsr(mode)
 #define DENORMALS_ARE_0 0x8040u
 #else // arm64
 #define EACH(name) name##_0_float, name##_0_double
+#define EACH_FLOAT(name) name##_0_float
 static const char *const names[] = {"NEON"};
 #define MODE() __builtin_arm_rsr64("fpcr")
 #define SET_MODE(mode) __builtin_arm_wsr64("fpcr", mode)
@@ -26,19 +28,21 @@ static const char *const names[] = {"NEON"};
 
 // Denormal numbers take a hundred times as long, and volumes that OSEM empties are full of them: they are 0 while a kernel
 // runs. Afterwards the thread has its own mode again.
-#define DISPATCH(name, Task)                                 \
-    Kernel##Task EACH(name);                                 \
+#define DISPATCH_TO(name, Task, number, ...)                  \
+    Kernel##Task __VA_ARGS__;                                \
     EXPORT void name(int64_t level, const Task *job) {       \
-        static Kernel##Task *const kernels[] = {EACH(name)}; \
+        static Kernel##Task *const kernels[] = {__VA_ARGS__}; \
         const __typeof__(MODE()) mode = MODE();              \
         SET_MODE(mode | DENORMALS_ARE_0);                    \
-        kernels[2 * level + job->is_double](job);            \
+        kernels[number](job);                                \
         SET_MODE(mode);                                      \
     }
+#define DISPATCH(name, Task) DISPATCH_TO(name, Task, 2 * level + job->is_double, EACH(name))
 
 typedef void KernelJob(const Job *);
 typedef void KernelDepthJob(const DepthJob *);
 typedef void KernelPlacesJob(const PlacesJob *);
+typedef void KernelPhotonJob(const PhotonJob *);
 
 DISPATCH(forward, Job)
 DISPATCH(backproject, Job)
@@ -52,17 +56,20 @@ DISPATCH(differentiate_places, DepthJob)
 DISPATCH(differentiate_taps, DepthJob)
 DISPATCH(take_at, PlacesJob)
 DISPATCH(give_at, PlacesJob)
+DISPATCH_TO(follow, PhotonJob, level, EACH_FLOAT(follow))
+DISPATCH_TO(see, PhotonJob, level, EACH_FLOAT(see))
 
 EXPORT const char *level_name(int64_t level) {
     return level < (int64_t)(sizeof(names) / sizeof(names[0])) ? names[level] : 0;
 }
 
-EXPORT void contract(int64_t numbers[5]) {
+EXPORT void contract(int64_t numbers[6]) {
     numbers[0] = CONTRACT;
     numbers[1] = sizeof(Job);
     numbers[2] = sizeof(Fan);
     numbers[3] = sizeof(DepthJob);
     numbers[4] = sizeof(PlacesJob);
+    numbers[5] = sizeof(PhotonJob);
 }
 
 #ifdef __x86_64__

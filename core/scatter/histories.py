@@ -1,0 +1,156 @@
+"""Histories of photons, by the C kernels: collisions in a body, and what each module sees of them."""
+
+import ctypes
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ..arrays import Array, Floats, Floats32, Integers
+from ..errors import InputError
+from ..progress import Progress, tell
+from ..rays.parallel import in_order, run_all
+from ..volumes.volume import Volume
+from .body import Body, coefficients, momentum_tables
+
+_HISTORIES_AT_ONCE = 2048  # of a piece of work: its collisions are some MB
+
+
+@dataclass(frozen=True, eq=False)
+class Source:
+    """Places and energies at which photons begin."""
+
+    voxels: Integers
+    """Flat indices (n,) of the voxels with activity."""
+    until: Floats
+    """Shares (n,) of the photons before each voxel."""
+    photons: float
+    """Photons per s of all voxels and lines."""
+    lines: Floats
+    """Energies, keV, and shares of the photons up to each line (2, n)."""
+
+    @classmethod
+    def of(cls, activity: Volume, lines: Sequence[tuple[float, float]]) -> "Source":
+        """Return the source of a volume of activity, kBq/mL, and photon lines: energies, keV, and photons per decay."""
+        values = activity.array.astype(np.float64).ravel()
+        if values.min(initial=0.0) < 0:
+            raise InputError(f"scatter: activity: expected 0 or more, got {values.min():g}")
+        voxels = np.flatnonzero(values)
+        until = np.concatenate([[0.0], np.cumsum(values[voxels])])
+        energies, photons = np.array(lines, np.float64).T
+        total = until[-1] * activity.grid.voxel_volume * photons.sum()
+        shares = np.cumsum(photons) / photons.sum()
+        return cls(voxels, until[:-1] / (until[-1] or 1.0), float(total), np.array([energies, shares]))
+
+
+class Histories:
+    """Histories of the photons of a source in a body, and what modules see of them.
+
+    Parameters
+    ----------
+    body, source, activity
+        The body, and the source made of the volume `activity`.
+    modules : array (M,)
+        Holes and what they see, of the type `rays.backends.cpu.MODULE`.
+    energies : array (n,)
+        Evenly spaced energies, keV, of the tables; photons below the first are not followed.
+    accepted : array (M, W, n)
+        Shares of the photons of these energies that are counted in each window.
+    cell_of, cells
+        Numbers of the cells of the body's voxels, and of all cells.
+    orders : int
+        Number of orders of scattering that are kept apart; the last has all from it on.
+    seed, threads : int
+        Seed of the random numbers, and number of threads. Results do not depend on the threads.
+    spectra : bool
+        Whether to keep the spectra of the photons that pass the holes.
+    """
+
+    def __init__(
+        self,
+        body: Body,
+        source: Source,
+        activity: Volume,
+        modules: Array,
+        energies: Floats,
+        accepted: Floats32,
+        cell_of: Array,
+        cells: int,
+        orders: int,
+        seed: int,
+        threads: int,
+        spectra: bool,
+    ) -> None:
+        self._kernels, self._threads = _kernels(), threads
+        self.seen = np.zeros((orders, accepted.shape[1], cells, len(modules)), np.float32)
+        self.spectra = np.zeros((len(modules), len(energies))) if spectra else None
+        self.followed = 0
+        tables = momentum_tables()
+        to_index = body.grid.index_from_world[:3].copy()
+        to_index[:, 3] += 0.5  # voxel i fills [i, i + 1)
+        to_world = activity.grid.affine[:3].copy()
+        to_world[:, 3] -= to_world[:, :3] @ [0.5, 0.5, 0.5]
+        self._arrays = [
+            body.densities, coefficients(energies), tables.incoherent, tables.coherent, tables.coherent_until,
+            source.until, np.ascontiguousarray(source.voxels, np.int64), np.ascontiguousarray(source.lines), modules,
+            np.ascontiguousarray(accepted, np.float32), np.ascontiguousarray(cell_of, np.int32), self.seen,
+        ]  # fmt: skip  # they live as long as the jobs that point at them
+        names = ("body", "coefficients", "incoherent", "coherent", "coherent_until", "activity_until", "source_voxels",
+                 "lines", "holes", "accepted", "cell_of", "seen")  # fmt: skip
+        numbers = {name: array.ctypes.data for name, array in zip(names, self._arrays, strict=True)}
+        step = float(energies[1] - energies[0])
+        self._settings: dict[str, Any] = numbers | {
+            "n": body.grid.shape, "index_from_world": tuple(to_index.ravel()), "energies": len(energies),
+            "lowest": float(energies[0]), "energies_per_kev": 1 / step, "momenta": tables.incoherent.shape[1],
+            "momenta_per_root": tables.per_root, "sources": len(source.voxels), "source_n": activity.grid.shape,
+            "world_from_source": tuple(to_world.ravel()), "n_lines": source.lines.shape[1], "seed": seed,
+            "modules": len(modules), "windows": accepted.shape[1], "orders": orders, "cells": cells,
+            "spectra": None if self.spectra is None else self.spectra.ctypes.data,
+        }  # fmt: skip
+
+    def run(self, count: int, progress: Progress | None = None) -> None:
+        """Follow so many further histories, and add what the modules see of them to `seen`."""
+        first, end = self.followed, self.followed + count
+        pieces = [(a, min(a + _HISTORIES_AT_ONCE, end)) for a in range(first, end, _HISTORIES_AT_ONCE)]
+        modules = self._settings["modules"]
+        size = -(-modules // self._threads)
+        parts = [(a, min(a + size, modules)) for a in range(0, modules, size)]
+        done = 0
+        for collisions in in_order(lambda piece: self._follow(*piece, first, count), pieces, self._threads):
+            for job in collisions:
+                run_all(lambda part, job=job: self._see(job, *part), parts, self._threads)  # type: ignore[misc]
+            done += 1
+            tell(progress, done, len(pieces))
+        self.followed = end
+
+    def _follow(self, first: int, end: int, all_first: int, count: int) -> list[tuple[Any, Array]]:
+        """Return the collisions of the histories from `first` to `end`, as jobs for `_see` with their arrays."""
+        found = []
+        while first < end:
+            collisions = np.empty(8 * (end - first) + self._kernels.MOST_COLLISIONS, f"V{self._kernels.COLLISION_BYTES}")
+            numbers = np.zeros(2, np.int64)
+            followed, n_collisions = (numbers[i:].ctypes.data for i in (0, 1))
+            job = self._kernels.PhotonJob(
+                **self._settings, first=first, last=end, all_first=all_first, histories=count,
+                collisions=collisions.ctypes.data, capacity=len(collisions), followed=followed, n_collisions=n_collisions,
+            )  # fmt: skip
+            self._kernels.library.follow(self._kernels.level, ctypes.byref(job))
+            first = int(numbers[0])
+            found.append((job, (collisions, numbers)))
+        return found
+
+    def _see(self, found: tuple[Any, Any], first: int, end: int) -> None:
+        """Add what the modules from `first` to `end` see of the collisions."""
+        job = self._kernels.PhotonJob.from_buffer_copy(found[0])
+        job.first_module, job.last_module = first, end
+        self._kernels.library.see(self._kernels.level, ctypes.byref(job))
+
+
+def _kernels() -> Any:
+    """Return the binding of the C kernels; raise `InputError` where there are none."""
+    try:
+        from ..rays.backends import cpu
+    except ImportError as error:
+        raise InputError(f"scatter needs the compiled kernels: {error}") from error
+    return cpu

@@ -1,0 +1,391 @@
+"""Images of photons that were scattered in a body, by Monte Carlo up to the modules and by the projector through them."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from ..arrays import Array, Floats, Floats32
+from ..errors import InputError
+from ..geometry.grid import Grid
+from ..geometry.views import Views
+from ..models.emission import Emission
+from ..physics.energy_window import acceptance
+from ..physics.isotopes import Window
+from ..physics.mass_attenuation import HIGHEST_ENERGY
+from ..physics.materials import APERTURES, CRYSTALS, attenuation, module_coefficients
+from ..progress import Progress, part_of
+from ..projector.operator import Projector
+from ..rays.parallel import in_order, thread_count
+from ..rays.ray_geometry import view_rays
+from ..recording import recorded_warnings
+from ..validation import freeze, instance, positive, real_array, seed_number, strict_whole
+from ..volumes.volume import Volume, require_quantity
+from .body import LOWEST_ENERGY, Body
+from .histories import Histories, Source
+
+_ENERGIES = 512  # of the tables
+_LEAST_SHARE = 1e-4  # of the photons of an energy that a window counts: below it they are not followed
+_CELL, _MOST_CELLS = 5.0, 150_000  # least side, mm, and number of the cells whose collisions a module sees as one
+_PARTS, _ROUNDS = 4, 4  # parts by whose differences deviations are known, and rounds of each for those of totals
+LEAST = 1.0
+_PILOT = 1024  # histories of a round of the trial
+
+
+@dataclass(frozen=True, eq=False)
+class ScatterImages:
+    """Images of scattered photons, with what is known of their accuracy."""
+
+    images: Floats32
+    """Expected counts (W, M, n_v, n_u) of scattered photons in each window, module and pixel."""
+    deviation: Floats32
+    """Standard deviations (W, M, n_v, n_u) of `images`, from four independent parts, smoothed over 5 x 5 pixels."""
+    windows: tuple[Window, ...]
+    """Energy windows, keV."""
+    precision: Floats
+    """Standard deviations (W, M) of the modules' totals, as shares of them; 0 where nothing is counted."""
+    histories: int
+    """Number of photons that were followed."""
+    by_order: Floats32 | None = None
+    """Images (orders, W, M, n_v, n_u) of photons by their number of collisions, the last with all further ones; or None."""
+    energies: Floats | None = None
+    """Energies (n,), keV, of `spectra`; or None."""
+    spectra: Floats | None = None
+    """Scattered photons (M, n) that reach the crystal's side through the hole's effective area, by energy; or None."""
+
+
+def scatter_images(
+    activity: Volume,
+    body: Volume,
+    views: Views,
+    model: Emission,
+    *,
+    windows: Sequence[Window] | None = None,
+    histories: int | None = None,
+    precision: float = 0.005,
+    orders: int = 1,
+    spectra: bool = False,
+    seed: int = 0,
+    threads: int | None = None,
+    progress: Progress | None = None,
+) -> ScatterImages:
+    """Simulate the images of photons that are scattered in a body before they pass a module's hole.
+
+    Photons of all lines of the model's isotope begin where the activity is, and are followed through the voxels of the body:
+    Compton scattering by Klein and Nishina's law and the incoherent scattering function, Rayleigh scattering by form
+    factors, absorption by weight. At each collision the chance that the photon is scattered into a module's hole, and what
+    remains of it on the way there at its new energy, are added to an emission that the module would see alike; the
+    projector makes the image of that emission, with the model's hole, crystal, blur and efficiencies. So one history
+    serves all modules. Photons that are not scattered are the projector's alone.
+
+    Aperture and crystal stop photons as at their own energy where the model has the materials' names; numbers hold for all
+    energies. Photons that are scattered in apertures, walls and crystals are not simulated, nor those through walls.
+
+    Parameters
+    ----------
+    activity : Volume
+        Activity, kBq/mL, at the model's reference time.
+    body : Volume
+        CT numbers ("hu"), or attenuation coefficients ("mu", 1/mm) at the strongest line in the model's window, on any
+        grid. The latter are taken for water of another density.
+    views : Views
+        The model's views.
+    model : Emission
+        Model of the counts, with an isotope and `energy_fwhm`. Its mu and background do not matter.
+    windows : sequence of (low, high), optional
+        Energy windows, keV, which the same histories fill. None: the model's.
+    histories : int, optional
+        Number of histories. None: as many as `precision` takes.
+    precision : float
+        Relative standard deviation of each module's total in the first window, up to which histories go on.
+    orders : int
+        Number of orders of scattering whose images are kept apart; the last has all from it on.
+    spectra : bool
+        Whether to return the spectra of the photons that reach the crystals, from 30 keV on.
+    seed : int
+        Seed of the random numbers: the same gives the same images, whatever the number of threads.
+    threads : int, optional
+        Number of threads, by default one per core.
+    progress : callable, optional
+        Called as ``progress(done, total)``; may raise `Cancelled`.
+
+    Returns
+    -------
+    ScatterImages
+        Images (W, M, n_v, n_u) in counts, their standard deviations, spectra.
+
+    Raises
+    ------
+    InputError
+        The model has no isotope or no energy resolution, a volume holds another quantity or values below 0, a window is
+        not two ascending energies, or lines are beyond the tables.
+
+    References
+    ----------
+    F. J. Beekman, H. W. A. M. de Jong, S. van Geloven, "Efficient fully 3-D iterative SPECT reconstruction with Monte
+    Carlo-based scatter compensation", IEEE Transactions on Medical Imaging 21 (2002) 867-877. S. Liu, M. A. King, A. B.
+    Brill, M. G. Stabin, T. H. Farncombe, "Accelerated SPECT Monte Carlo simulation using multiple projection sampling and
+    convolution-based forced detection", IEEE Transactions on Nuclear Science 55 (2008) 560-567.
+    """
+    instance(activity, Volume, "scatter: activity")
+    instance(body, Volume, "scatter: body")
+    instance(model, Emission, "scatter: model")
+    require_quantity(activity.quantity, ("activity",), "scatter: activity")
+    if model.isotope is None:
+        raise InputError("scatter: the model has no isotope, whose photons have energies: give isotope='Tc-99m'")
+    if model.energy_fwhm is None:
+        raise InputError("scatter: the model has no energy resolution: give energy_fwhm, such as 0.1 for NaI, 0.05 for CZT")
+    model.check(views)
+    chosen = tuple(_checked_window(window) for window in (windows or [model.window]))
+    run = _Run(activity, body, views, model, chosen, orders, spectra, seed_number(seed), thread_count(threads))
+    if histories is not None:
+        count = strict_whole(histories, "scatter: histories", "1 or more")
+        run.follow(-(-count // (_PARTS * _ROUNDS)), progress)
+    else:
+        run.follow_until(positive(precision, "scatter: precision"), progress)
+    return run.result()
+
+
+def _checked_window(window: Any) -> Window:
+    """Return a window as two numbers; raise `InputError` unless they are ascending energies."""
+    low, high = real_array(window, "scatter: window", (2,)).tolist()
+    if not 0 <= low < high:
+        raise InputError(f"scatter: window: expected two ascending energies, keV, got {low:g} and {high:g}")
+    return low, high
+
+
+class _Run:
+    """A simulation of the images of scattered photons; see `scatter_images`."""
+
+    def __init__(
+        self,
+        activity: Volume,
+        body: Volume,
+        views: Views,
+        model: Emission,
+        windows: tuple[Window, ...],
+        orders: int,
+        spectra: bool,
+        seed: int,
+        threads: int,
+    ) -> None:
+        self._views, self._model, self._windows, self._threads = views, model, windows, threads
+        isotope: Any = model.isotope
+        lines = [line for line in (*isotope.lines, *isotope.weak_lines) if line[0] > LOWEST_ENERGY]
+        self._reference, _ = max(isotope.lines_within(*model.window), key=lambda line: line[1])  # type: ignore[misc]
+        self._body, self._source = Body.of(body, self._reference), Source.of(activity, lines)
+        self._energies = self._table_energies(max(energy for energy, _ in lines), spectra)
+        cell_of, self._cells = _cells(self._body.grid)
+        self._modules = _modules(views, model, float(np.linalg.norm(self._cells.spacing)))
+        self._sensitivity = _sensitivity(self._modules, self._cells)
+        orders = strict_whole(orders, "scatter: orders", "1 or more")
+        self._histories = Histories(
+            self._body, self._source, activity, self._modules, self._energies, self._accepted(),
+            cell_of, self._cells.n_voxels, orders, seed, threads, spectra,
+        )  # fmt: skip
+        self._rounds: list[Floats] = []  # totals (W, M) of each round, per history
+        self._parts = np.zeros((_PARTS, orders, len(windows), len(views), *views.shape), np.float32)
+        self._count = 0  # histories of a part
+        self._projectors = [self._projector(m) for m in range(len(views))]
+
+    def follow_until(self, precision: float, progress: Progress | None) -> None:
+        """Follow histories until all modules' totals in the first window are known to a relative `precision`."""
+        self._follow_rounds(_PILOT, part_of(progress, 0, 20))
+        self._histories.seen[:] = 0
+        self._modules["least"] = LEAST * np.max(np.mean(self._rounds, axis=0), axis=0)
+        needed = self._needed(_PILOT, precision)
+        self._rounds = []
+        for _ in range(3):  # the trial's deviations are not exact
+            self.follow(needed, progress and (lambda done, total: progress(total + 19 * done, 20 * total)))
+            more = self._needed(self._count // _ROUNDS, precision) - self._count // _ROUNDS
+            if more * 8 < needed:
+                return
+            needed = more
+
+    def _needed(self, count: int, precision: float) -> int:
+        """Return the number of histories of a round that a precision takes, by the rounds of `count` histories so far."""
+        error = float(self._errors()[0].max(initial=0.0))
+        return max(math.ceil(count * min((error / precision) ** 2, 1e4)), 16)
+
+    def _errors(self) -> Floats:
+        """Return the relative standard deviations (W, M) of the modules' totals, by the differences of rounds."""
+        rounds = np.array(self._rounds)
+        mean = rounds.mean(axis=0)
+        error = rounds.std(axis=0, ddof=1) / math.sqrt(len(rounds))
+        return np.divide(error, mean, out=np.zeros_like(mean), where=mean > 0)
+
+    def follow(self, count: int, progress: Progress | None) -> None:
+        """Follow `count` histories in each round of each part, and add their images to those of the parts."""
+        new = _ROUNDS * count
+        for k in range(_PARTS):
+            self._follow_rounds(count, part_of(progress, k, _PARTS), _ROUNDS)
+            images = self._project(self._histories.seen)
+            self._parts[k] += (images / new - self._parts[k]) * (new / (self._count + new))
+            self._histories.seen[:] = 0
+        self._count += new
+
+    def _follow_rounds(self, count: int, progress: Progress | None, rounds: int = _PARTS * _ROUNDS) -> None:
+        """Follow rounds of `count` histories, and keep their totals."""
+        before = 0.0
+        for k in range(rounds):
+            self._histories.run(count, part_of(progress, k, rounds))
+            total = np.einsum("owcm,cm->wm", self._histories.seen, self._sensitivity)
+            self._rounds.append((total - before) / count)
+            before = total
+
+    def _project(self, seen: Array) -> Array:
+        """Return the images (orders, W, M, n_v, n_u) of what the modules saw, for one history."""
+        scale = self._source.photons / self._cells.voxel_volume
+        images = np.empty(self._parts.shape[1:], np.float32)
+
+        def project(m: int) -> None:
+            for order, window in np.ndindex(images.shape[:2]):
+                emission = seen[order, window, :, m].reshape(self._cells.shape) * scale
+                images[order, window, m] = self._projectors[m](emission)[0] if emission.any() else 0
+
+        for _ in in_order(project, range(len(self._views)), self._threads):
+            pass
+        return images
+
+    def result(self) -> ScatterImages:
+        """Return the images, whose spectra are those of all histories."""
+        total = self._parts.sum(axis=1)  # over orders
+        variance = total.var(axis=0, ddof=1) / _PARTS
+        histories = self._histories.followed
+        spectra = self._histories.spectra
+        scale = self._source.photons / histories * np.broadcast_to(self._model.effective_time, len(self._views))
+        return ScatterImages(
+            images=freeze(total.mean(axis=0)),
+            deviation=freeze(np.sqrt(_smoothed(variance))),
+            windows=self._windows,
+            precision=freeze(self._errors()),
+            histories=histories,
+            by_order=freeze(self._parts.mean(axis=0)) if len(self._parts[0]) > 1 else None,
+            energies=None if spectra is None else freeze(self._energies),
+            spectra=None if spectra is None else freeze(spectra * scale[:, None]),
+        )
+
+    def _projector(self, m: int) -> Projector:
+        """Return the projector of an emission that module m alone sees, one photon per decay, without attenuation."""
+        model, optics = self._model, self._model.optics
+        plain = replace(
+            model, mu=None, isotope=None, window=None, energy_fwhm=None, lines="together", photons_per_decay=1.0,
+            aperture_mu=optics.aperture_mu, crystal_mu=optics.crystal_mu, wall_thickness=None, background=0.0,
+            time=model.effective_time, start=0.0,
+        )  # fmt: skip
+        one = np.array([m])
+        with recorded_warnings():  # they are those of the model's own projector
+            return Projector(self._cells, self._views[one], plain.of_views(one), threads=1)
+
+    def _table_energies(self, highest: float, spectra: bool) -> Floats:
+        """Return the energies, keV, of the tables: from the lowest that a window counts to the highest of the lines."""
+        if highest > HIGHEST_ENERGY:
+            expected = f"photons up to {HIGHEST_ENERGY:g} keV, of which there are tables"
+            raise InputError(f"scatter: expected {expected}; the isotope has some of {highest:g} keV")
+        energies = np.linspace(LOWEST_ENERGY, highest, 4 * _ENERGIES)
+        shares = [max(self._share(energy, window) for window in self._windows) for energy in energies]
+        counted = np.flatnonzero(np.array(shares) > _LEAST_SHARE)
+        lowest = LOWEST_ENERGY if spectra else float(energies[counted[0]]) if len(counted) else highest - 1
+        return np.linspace(min(lowest, highest - 1), highest, _ENERGIES)
+
+    def _share(self, energy: float, window: Window) -> float:
+        """Return the share of the photons of an energy, keV, that a window counts."""
+        fwhm: Any = self._model.energy_fwhm
+        return acceptance(energy, window, fwhm * math.sqrt(self._reference * energy))
+
+    def _accepted(self) -> Floats32:
+        """Return the shares (M, W, n) of photons that are counted, by those of the projector's hole and crystal."""
+        shares = np.array([[self._share(energy, window) for energy in self._energies] for window in self._windows])
+        return np.asarray(_optics_ratio(self._model, self._energies)[:, None] * shares, np.float32)
+
+
+def _optics_ratio(model: Emission, energies: Floats) -> Floats:
+    """Return the share of photons (M, n) that pass hole and crystal at these energies, by that at the model's lines.
+
+    Coefficients that are a material's at the model's lines are that material's at other energies.
+    """
+    system, optics, lines = model.system, model.optics, model.photon_lines
+    diameters = np.broadcast_to(system.pinhole_diameter, len(system))
+    thickness = np.broadcast_to(system.detector_thickness, len(system))
+    ratio = np.ones((len(system), len(energies)))
+    if optics.aperture_mu is not None:
+        for name in APERTURES:
+            if module_coefficients(name, None, lines, system, optics.opening_angle)[0] == optics.aperture_mu:
+                for i, energy in enumerate(energies):
+                    there = optics.with_numbers({"aperture_mu": attenuation(name, energy)})
+                    ratio[:, i] *= (there.effective_diameter(diameters) / optics.effective_diameter(diameters)) ** 2
+    if optics.crystal_mu is not None:
+        usual = np.broadcast_to(optics.crystal_mu, len(system))
+        for m in range(len(system)):
+            if name := system.crystal_material[m] or _crystal_of(model, float(usual[m])):
+                mu = np.array([attenuation(name, energy) for energy in energies])
+                ratio[m] *= np.expm1(-mu * thickness[m]) / np.expm1(-usual[m] * thickness[m])
+    return ratio
+
+
+def _crystal_of(model: Emission, mu: float) -> str:
+    """Return the crystal that has this coefficient at the model's lines; "" if none has."""
+    arguments = model.photon_lines, model.system, model.optics.opening_angle
+    found = (name for name in CRYSTALS if np.any(np.equal(module_coefficients(None, name, *arguments)[1], mu)))
+    return next(found, "")
+
+
+def _cells(grid: Grid) -> tuple[Array, Grid]:
+    """Return the numbers of the cells (n_x, n_y, n_z) of a grid's voxels, and the grid of the cells."""
+    steps = np.maximum(np.round(_CELL / grid.spacing), 1).astype(int)
+    while np.prod(shape := -(-np.array(grid.shape) // steps)) > _MOST_CELLS:
+        steps[np.argmin(steps * grid.spacing)] += 1
+    i, j, k = (np.arange(n) // step for n, step in zip(grid.shape, steps, strict=True))
+    numbers = np.ravel_multi_index(np.ix_(i, j, k), shape)
+    affine = grid.affine.copy()
+    affine[:3, :3] *= steps
+    affine[:3, 3] += grid.affine[:3, :3] @ ((steps - 1) / 2)
+    return numbers, Grid(tuple(int(n) for n in shape), affine)
+
+
+def _modules(views: Views, model: Emission, cell: float) -> Array:
+    """Return the modules (M,) as the kernels take them; `cell` is the diagonal of a cell, mm."""
+    from ..rays.backends.cpu import MODULE
+
+    modules = np.zeros(len(views), MODULE)
+    n_v, n_u = views.shape
+    diameters = np.broadcast_to(model.effective_diameter, len(views))
+    for m, (u, v, axis) in enumerate(model.system.frames()):
+        fan = view_rays(views, m)
+        ends = fan.corner - fan.source + np.array([
+            (i * n_v - 0.5) * fan.row_step + (j * n_u - 0.5) * fan.column_step for i in (0, 1) for j in (0, 1)
+        ])  # fmt: skip
+        slopes_u, slopes_v = (ends @ side / (ends @ axis) for side in (u, v))
+        spread = 1.5 * diameters[m] + 3 * np.max(model.intrinsic_fwhm)
+        modules[m] = (
+            views.sources[m], u, v, axis, (slopes_u.min(), slopes_u.max(), slopes_v.min(), slopes_v.max()),
+            1.5 * diameters[m] + cell, spread / model.system.collimator_length[m], 0.0, diameters[m] ** 2 / 16, 0.0,
+        )  # fmt: skip
+    return modules
+
+
+def _sensitivity(modules: Array, cells: Grid) -> Floats32:
+    """Return the shares of the photons (cells, M) that a module's hole passes from the middle of each cell it sees."""
+    index = np.indices(cells.shape).reshape(3, -1)
+    places = (cells.affine[:3, :3] @ index + cells.affine[:3, 3:]).T
+    result = np.zeros((len(places), len(modules)), np.float32)
+    for m, module in enumerate(modules):
+        to = places - module["hole"]
+        height = to @ module["axis"]
+        slopes = (to @ module[side] / np.where(height > 0, height, np.inf) for side in "uv")
+        seen = height > 0
+        for slope, low, high in zip(slopes, module["slopes"][::2], module["slopes"][1::2], strict=True):
+            seen &= (slope > low) & (slope < high)
+        result[:, m] = np.where(seen, module["area"] * height / np.maximum(np.linalg.norm(to, axis=1), 1e-9) ** 3, 0)
+    return result
+
+
+def _smoothed(variance: Array) -> Array:
+    """Return variances (..., n_v, n_u) as means of the 5 x 5 pixels around each, those within the image."""
+    for axis in (-2, -1):
+        n = variance.shape[axis]
+        near = (abs(np.subtract.outer(np.arange(n), np.arange(n))) <= 2).astype(np.float32)
+        variance = np.moveaxis(np.tensordot(near / near.sum(axis=1, keepdims=True), variance, (1, axis)), 0, axis)
+    return variance

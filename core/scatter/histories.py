@@ -9,22 +9,25 @@ import numpy as np
 
 from ..arrays import Array, Floats, Floats32, Integers
 from ..errors import InputError
+from ..geometry.grid import Grid
 from ..progress import Progress, tell
 from ..rays.parallel import in_order, run_all
 from ..volumes.volume import Volume
 from .body import Body, coefficients, momentum_tables
 
+_STEPS = (1 / 1.1347241384015194) ** np.arange(1, 6)  # 5 dimensions: powers of the root of x^6 = x + 1
 _HISTORIES_AT_ONCE = 2048  # of a piece of work: its collisions are some MB
 
 
 @dataclass(frozen=True, eq=False)
 class Source:
-    """Places and energies at which photons begin."""
+    """Photons that begin in the voxels of a volume of activity, to all sides."""
 
+    grid: Grid
     voxels: Integers
-    """Flat indices (n,) of the voxels with activity."""
+    """Indices (n, 3) of the voxels with activity, neighbours close to one another."""
     until: Floats
-    """Shares (n,) of the photons before each voxel."""
+    """Shares (n,) of the photons up to each voxel."""
     photons: float
     """Photons per s of all voxels and lines."""
     lines: Floats
@@ -33,15 +36,42 @@ class Source:
     @classmethod
     def of(cls, activity: Volume, lines: Sequence[tuple[float, float]]) -> "Source":
         """Return the source of a volume of activity, kBq/mL, and photon lines: energies, keV, and photons per decay."""
-        values = activity.array.astype(np.float64).ravel()
+        values = activity.array.astype(np.float64)
         if values.min(initial=0.0) < 0:
             raise InputError(f"scatter: activity: expected 0 or more, got {values.min():g}")
-        voxels = np.flatnonzero(values)
-        until = np.concatenate([[0.0], np.cumsum(values[voxels])])
+        voxels = np.argwhere(values)
+        bits = np.arange(20)
+        interleaved = ((voxels[:, None, :] >> bits[:, None] & 1) << (3 * bits[:, None] + [2, 1, 0])).sum(axis=(1, 2))
+        voxels = voxels[np.argsort(interleaved)]  # G. M. Morton's order
+        until = np.cumsum(values[tuple(voxels.T)])
+        whole = float(until[-1]) if len(until) else 0.0
         energies, photons = np.array(lines, np.float64).T
-        total = until[-1] * activity.grid.voxel_volume * photons.sum()
+        total = whole * activity.grid.voxel_volume * photons.sum()
         shares = np.cumsum(photons) / photons.sum()
-        return cls(voxels, until[:-1] / (until[-1] or 1.0), float(total), np.array([energies, shares]))
+        return cls(activity.grid, voxels, until / (whole or 1.0), float(total), np.array([energies, shares]))
+
+    def starts(self, first: int, end: int, seed: int, all_first: int) -> Array:
+        """Return the photons from number `first` to `end` of those from `all_first` on, of the type `rays.backends.cpu.START`.
+
+        Places, directions, energies and first collisions are quasi-random: points of a Kronecker sequence that `seed` and
+        `all_first` shift at random, so that each set of them is an unbiased sample of its own.
+        """
+        from ..rays.backends.cpu import START
+
+        shift = np.random.default_rng([seed, all_first]).random(len(_STEPS))
+        shares = (np.arange(first - all_first, end - all_first)[:, None] * _STEPS + shift) % 1
+        inside = np.random.default_rng([seed, all_first, first]).random((end - first, 3)) - 0.5
+        voxels = self.voxels[np.minimum(np.searchsorted(self.until, shares[:, 0], side="right"), len(self.voxels) - 1)]
+        starts = np.empty(end - first, START)
+        affine = self.grid.affine
+        starts["place"] = (voxels + inside) @ affine[:3, :3].T + affine[:3, 3]
+        cosine, azimuth = 2 * shares[:, 1] - 1, 2 * np.pi * shares[:, 2]
+        sine = np.sqrt(1 - cosine**2)
+        starts["direction"] = np.stack([sine * np.cos(azimuth), sine * np.sin(azimuth), cosine], axis=-1)
+        energies, until = self.lines
+        starts["energy"] = energies[np.minimum(np.searchsorted(until, shares[:, 4], side="right"), len(energies) - 1)]
+        starts["collides_at"] = np.clip(shares[:, 3], 1e-12, 1 - 1e-12)
+        return starts
 
 
 class Histories:
@@ -49,8 +79,8 @@ class Histories:
 
     Parameters
     ----------
-    body, source, activity
-        The body, and the source made of the volume `activity`.
+    body, source
+        Where photons scatter, and where they begin.
     modules : array (M,)
         Holes and what they see, of the type `rays.backends.cpu.MODULE`.
     energies : array (n,)
@@ -71,7 +101,6 @@ class Histories:
         self,
         body: Body,
         source: Source,
-        activity: Volume,
         modules: Array,
         energies: Floats,
         accepted: Floats32,
@@ -83,28 +112,24 @@ class Histories:
         spectra: bool,
     ) -> None:
         self._kernels, self._threads = _kernels(), threads
+        self._source = source
         self.seen = np.zeros((orders, accepted.shape[1], cells, len(modules)), np.float32)
         self.spectra = np.zeros((len(modules), len(energies))) if spectra else None
         self.followed = 0
         tables = momentum_tables()
         to_index = body.grid.index_from_world[:3].copy()
         to_index[:, 3] += 0.5  # voxel i fills [i, i + 1)
-        to_world = activity.grid.affine[:3].copy()
-        to_world[:, 3] -= to_world[:, :3] @ [0.5, 0.5, 0.5]
         self._arrays = [
             body.densities, coefficients(energies), tables.incoherent, tables.coherent, tables.coherent_until,
-            source.until, np.ascontiguousarray(source.voxels, np.int64), np.ascontiguousarray(source.lines), modules,
-            np.ascontiguousarray(accepted, np.float32), np.ascontiguousarray(cell_of, np.int32), self.seen,
+            modules, np.ascontiguousarray(accepted, np.float32), np.ascontiguousarray(cell_of, np.int32), self.seen,
         ]  # fmt: skip  # they live as long as the jobs that point at them
-        names = ("body", "coefficients", "incoherent", "coherent", "coherent_until", "activity_until", "source_voxels",
-                 "lines", "holes", "accepted", "cell_of", "seen")  # fmt: skip
+        names = ("body", "coefficients", "incoherent", "coherent", "coherent_until", "holes", "accepted", "cell_of", "seen")  # fmt: skip
         numbers = {name: array.ctypes.data for name, array in zip(names, self._arrays, strict=True)}
         step = float(energies[1] - energies[0])
         self._settings: dict[str, Any] = numbers | {
             "n": body.grid.shape, "index_from_world": tuple(to_index.ravel()), "energies": len(energies),
             "lowest": float(energies[0]), "energies_per_kev": 1 / step, "momenta": tables.incoherent.shape[1],
-            "momenta_per_root": tables.per_root, "sources": len(source.voxels), "source_n": activity.grid.shape,
-            "world_from_source": tuple(to_world.ravel()), "n_lines": source.lines.shape[1], "seed": seed,
+            "momenta_per_root": tables.per_root, "seed": seed,
             "modules": len(modules), "windows": accepted.shape[1], "orders": orders, "cells": cells,
             "spectra": None if self.spectra is None else self.spectra.ctypes.data,
         }  # fmt: skip
@@ -117,27 +142,29 @@ class Histories:
         size = -(-modules // self._threads)
         parts = [(a, min(a + size, modules)) for a in range(0, modules, size)]
         done = 0
-        for collisions in in_order(lambda piece: self._follow(*piece, first, count), pieces, self._threads):
+        for collisions in in_order(lambda piece: self._follow(*piece, first), pieces, self._threads):
             for job in collisions:
                 run_all(lambda part, job=job: self._see(job, *part), parts, self._threads)  # type: ignore[misc]
             done += 1
             tell(progress, done, len(pieces))
         self.followed = end
 
-    def _follow(self, first: int, end: int, all_first: int, count: int) -> list[tuple[Any, Array]]:
+    def _follow(self, first: int, end: int, all_first: int) -> list[tuple[Any, Array]]:
         """Return the collisions of the histories from `first` to `end`, as jobs for `_see` with their arrays."""
         found = []
+        starts = self._source.starts(first, end, self._settings["seed"], all_first)
+        begins = first
         while first < end:
             collisions = np.empty(8 * (end - first) + self._kernels.MOST_COLLISIONS, f"V{self._kernels.COLLISION_BYTES}")
             numbers = np.zeros(2, np.int64)
             followed, n_collisions = (numbers[i:].ctypes.data for i in (0, 1))
             job = self._kernels.PhotonJob(
-                **self._settings, first=first, last=end, all_first=all_first, histories=count,
+                **self._settings, all_first=begins, first=first, last=end, starts=starts.ctypes.data,
                 collisions=collisions.ctypes.data, capacity=len(collisions), followed=followed, n_collisions=n_collisions,
             )  # fmt: skip
             self._kernels.library.follow(self._kernels.level, ctypes.byref(job))
             first = int(numbers[0])
-            found.append((job, (collisions, numbers)))
+            found.append((job, (collisions, numbers, starts)))
         return found
 
     def _see(self, found: tuple[Any, Any], first: int, end: int) -> None:

@@ -182,7 +182,7 @@ class _Run:
         self._sensitivity = _sensitivity(self._modules, self._cells)
         orders = strict_whole(orders, "scatter: orders", "1 or more")
         self._histories = Histories(
-            self._body, self._source, activity, self._modules, self._energies, self._accepted(),
+            self._body, self._source, self._modules, self._energies, self._accepted(),
             cell_of, self._cells.n_voxels, orders, seed, threads, spectra,
         )  # fmt: skip
         self._rounds: list[Floats] = []  # totals (W, M) of each round, per history

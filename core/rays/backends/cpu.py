@@ -92,9 +92,8 @@ class PhotonJob(Structure):
         ("is_double", c_int64), ("body", c_void_p), ("n", c_int64 * 3), ("index_from_world", c_double * 12),
         ("energies", c_int64), ("lowest", c_double), ("energies_per_kev", c_double), ("coefficients", c_void_p),
         ("momenta", c_int64), ("momenta_per_root", c_double), ("incoherent", c_void_p), ("coherent", c_void_p),
-        ("coherent_until", c_void_p), ("activity_until", c_void_p), ("source_voxels", c_void_p), ("sources", c_int64),
-        ("source_n", c_int64 * 3), ("world_from_source", c_double * 12), ("lines", c_void_p), ("n_lines", c_int64),
-        ("seed", c_uint64), ("first", c_int64), ("last", c_int64), ("all_first", c_int64), ("histories", c_int64),
+        ("coherent_until", c_void_p), ("seed", c_uint64), ("all_first", c_int64), ("first", c_int64), ("last", c_int64),
+        ("starts", c_void_p),
         ("collisions", c_void_p), ("capacity", c_int64), ("followed", c_void_p), ("n_collisions", c_void_p), ("holes", c_void_p),
         ("modules", c_int64), ("first_module", c_int64), ("last_module", c_int64), ("accepted", c_void_p),
         ("windows", c_int64), ("orders", c_int64), ("cell_of", c_void_p), ("cells", c_int64), ("seen", c_void_p),
@@ -102,6 +101,8 @@ class PhotonJob(Structure):
     ]  # fmt: skip
 
 
+START = np.dtype([("place", "3f8"), ("direction", "3f8"), ("energy", "f8"), ("collides_at", "f8")])
+"""A photon that begins, as kernels.h has it: `Start`."""
 MODULE = np.dtype([
     ("hole", "3f8"), ("u", "3f8"), ("v", "3f8"), ("axis", "3f8"), ("slopes", "4f8"), ("margin", "f8"),
     ("margin_by_height", "f8"), ("nearest", "f8"), ("area", "f8"),

@@ -134,6 +134,11 @@ typedef struct {
 #define MOST_COLLISIONS 64 // of a history
 
 typedef struct {
+    double place[3], direction[3], energy; // of the photon when it begins
+    double collides_at;                    // quantile of its first collision along the way through the body, above 0 and below 1
+} Start;
+
+typedef struct {
     double place[3], direction[3], energy; // before the collision
     float weight;                          // photons, of 1 that began
     int32_t voxel, order;                  // voxel of the body; 1 for the first collision
@@ -160,15 +165,9 @@ typedef struct {
     double momenta_per_root;
     const float *incoherent, *coherent; // (MATERIALS, momenta): r_e^2 / 2 times electrons per mm^3 times S(x), or F(x)^2, 1/mm
     const float *coherent_until;        // (MATERIALS, momenta): integral of F(x)^2 over x^2 from 0
-    const double *activity_until;       // (sources): shares of the activity before each source, ascending, from 0
-    const int64_t *source_voxels;       // (sources): flat indices of the voxels in source_n
-    int64_t sources, source_n[3];
-    double world_from_source[3][4];     // of the index space in which voxel i fills [i, i + 1)
-    const double *lines; // (2, n_lines): energies, and the shares of the photons up to each line
-    int64_t n_lines;
     uint64_t seed;
-    int64_t first, last;           // numbers of the histories that are followed
-    int64_t all_first, histories;  // first and number of those over which the activity is spread evenly
+    int64_t all_first, first, last; // numbers of the histories: the one of the first start, and those that are followed
+    const Start *starts;            // (last - all_first)
     Collision *collisions;
     int64_t capacity;                  // at least MOST_COLLISIONS
     int64_t *followed, *n_collisions;  // results of follow: the first history that had no room, and the number of collisions

@@ -199,29 +199,13 @@ static void turn(double *direction, double cosine, Random *random) {
 
 // --- histories -----------------------------------------------------------------------------------------------------------------
 
-static int64_t source_voxel(const PhotonJob *job, double sought) {
-    int64_t low = 0, high = job->sources;
-    while (high - low > 1) {
-        const int64_t middle = (low + high) / 2;
-        if (job->activity_until[middle] <= sought) low = middle;
-        else high = middle;
-    }
-    return low;
-}
-
 void KERNEL(follow)(const PhotonJob *job) {
     int64_t n = 0, history = job->first;
     for (; history < job->last && job->capacity - n >= MOST_COLLISIONS; history++) {
         Random random = mixed(job->seed ^ mixed((uint64_t)history + 1));
-        const double sought = ((double)(history - job->all_first) + uniform(&random)) / (double)job->histories;
-        const int64_t voxel = job->source_voxels[source_voxel(job, sought)], line = voxel / job->source_n[2];
-        const double from[3] = {(double)(line / job->source_n[1]), (double)(line % job->source_n[1]), (double)(voxel % job->source_n[2])};
-        const double begin[3] = {from[0] + uniform(&random), from[1] + uniform(&random), from[2] + uniform(&random)};
-        double place[3], direction[3] = {0, 0, 1}, energy = job->lines[0];
-        for (int i = 0; i < 3; i++) place[i] = dot(job->world_from_source[i], begin) + job->world_from_source[i][3];
-        const double which = uniform(&random);
-        for (int64_t i = 1; i < job->n_lines && job->lines[job->n_lines + i - 1] <= which; i++) energy = job->lines[i];
-        turn(direction, 2 * uniform(&random) - 1, &random);
+        const Start *start = job->starts + (history - job->all_first);
+        double place[3], direction[3], energy = start->energy;
+        for (int i = 0; i < 3; i++) place[i] = start->place[i], direction[i] = start->direction[i];
         float weight = 1;
         for (int order = 1; order <= MOST_COLLISIONS; order++) {
             const Between at = energy_place(job, energy);
@@ -231,8 +215,9 @@ void KERNEL(follow)(const PhotonJob *job) {
             walk(job, place, direction, FAR, mu, FAR, paths, &left, &hit);
             const double depth = paths[0] * mu[0] + paths[1] * mu[1], collides = 1 - exponential((float)-depth);
             if (!(depth > 1e-7)) break;
-            const double distance =
-                walk(job, place, direction, FAR, mu, (float)(depth_of(1 - collides * uniform(&random)) * (1 - 1e-6)), paths, &left, &hit);
+            const double share = order == 1 ? start->collides_at : uniform(&random);
+            const float until = (float)(depth_of(1 - collides * share) * (1 - 1e-6));
+            const double distance = walk(job, place, direction, FAR, mu, until, paths, &left, &hit);
             if (left > 0) break; // by rounding alone
             for (int i = 0; i < 3; i++) place[i] += distance * direction[i];
             weight *= (float)collides;

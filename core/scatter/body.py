@@ -8,7 +8,7 @@ import numpy as np
 from ..arrays import Floats, Floats32
 from ..errors import InputError
 from ..geometry.grid import Grid
-from ..physics.ct_numbers import mu_of_hu
+from ..physics.ct_numbers import hu_to_mu
 from ..physics.mass_attenuation import HIGHEST_ENERGY
 from ..physics.materials import attenuation
 from ..physics.photon_scattering import WAVELENGTH_ENERGY, Scatterer
@@ -34,17 +34,15 @@ class Body:
     def of(cls, volume: Volume, energy: float) -> "Body":
         """Return the body of a volume of CT numbers ("hu"), or of attenuation coefficients at `energy`, keV ("mu").
 
-        CT numbers become the mixture of air, water and cortical bone that `hu_to_mu` makes of them. Attenuation coefficients
-        are those of water of another density. Voxels around the body that hold nothing are left out.
+        CT numbers become mu as by `hu_to_mu`, and mu becomes what that function mixes: up to water's it is water of less
+        density, above it a mixture of water and cortical bone. Voxels around the body that hold nothing are left out.
         """
         require_quantity(volume.quantity, ("hu", "mu"), "scatter: body")
         water, bone = (attenuation(each.material, energy) for each in SCATTERERS)
-        mu = np.asarray(volume.array if volume.quantity == "mu" else mu_of_hu(volume.array, energy), np.float64)
+        mu = (volume if volume.quantity == "mu" else hu_to_mu(volume, energy)).array.astype(np.float64)
         if mu.size and mu.min() < 0:
             raise InputError(f"scatter: body: expected attenuation coefficients of 0 or more, got {mu.min():g}")
-        share = np.zeros(mu.shape)  # of bone
-        if volume.quantity == "hu":
-            share = np.where(volume.array > 0, np.clip((mu - water) / (bone - water), 0, 1), 0)
+        share = np.clip((mu - water) / (bone - water), 0, 1)  # of bone
         densities = np.stack([np.where(share < 1, (mu - share * bone) / water, 0), np.where(share < 1, share, mu / bone)], -1)
         filled = np.nonzero(mu > 1e-3 * water)  # air is not
         if not len(filled[0]):

@@ -61,6 +61,8 @@ class Source:
         shift = np.random.default_rng([seed, all_first]).random(len(_STEPS))
         shares = (np.arange(first - all_first, end - all_first)[:, None] * _STEPS + shift) % 1
         inside = np.random.default_rng([seed, all_first, first]).random((end - first, 3)) - 0.5
+        if not len(self.voxels):
+            return np.empty(0, START)
         voxels = self.voxels[np.minimum(np.searchsorted(self.until, shares[:, 0], side="right"), len(self.voxels) - 1)]
         starts = np.empty(end - first, START)
         affine = self.grid.affine
@@ -149,13 +151,20 @@ class Histories:
             tell(progress, done, len(pieces))
         self.followed = end
 
+    def collisions(self, count: int) -> Array:
+        """Return the collisions of so many further histories, of the type `rays.backends.cpu.COLLISION`."""
+        first, self.followed = self.followed, self.followed + count
+        found = self._follow(first, self.followed, first)
+        return np.concatenate([arrays[0][: arrays[1][1]] for _, arrays in found])
+
     def _follow(self, first: int, end: int, all_first: int) -> list[tuple[Any, Array]]:
         """Return the collisions of the histories from `first` to `end`, as jobs for `_see` with their arrays."""
         found = []
         starts = self._source.starts(first, end, self._settings["seed"], all_first)
+        end = first + len(starts)  # none where nothing is active
         begins = first
         while first < end:
-            collisions = np.empty(8 * (end - first) + self._kernels.MOST_COLLISIONS, f"V{self._kernels.COLLISION_BYTES}")
+            collisions = np.empty(8 * (end - first) + self._kernels.MOST_COLLISIONS, self._kernels.COLLISION)
             numbers = np.zeros(2, np.int64)
             followed, n_collisions = (numbers[i:].ctypes.data for i in (0, 1))
             job = self._kernels.PhotonJob(

@@ -89,7 +89,7 @@ def scatter_images(
         Activity, kBq/mL, at the model's reference time.
     body : Volume
         CT numbers ("hu"), or attenuation coefficients ("mu", 1/mm) at the strongest line in the model's window, on any
-        grid. The latter are taken for water of another density.
+        grid. The body consists of what `hu_to_mu` mixes: water of any density up to its own, and bone.
     views : Views
         The model's views.
     model : Emission

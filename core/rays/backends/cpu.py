@@ -109,7 +109,11 @@ MODULE = np.dtype([
     ("least", "f8"),
 ])  # fmt: skip
 """A module that sees photons, as kernels.h has it: `Module`."""
-COLLISION_BYTES, MOST_COLLISIONS = 72, 64  # in kernels.h
+COLLISION = np.dtype([
+    ("place", "3f8"), ("direction", "3f8"), ("energy", "f8"), ("weight", "f4"), ("voxel", "i4"), ("order", "i4"),
+], align=True)  # fmt: skip
+"""A collision of a photon, as kernels.h has it: `Collision`."""
+MOST_COLLISIONS = 64  # in kernels.h
 
 _KERNELS = {
     _Job: ("forward", "backproject", "differentiate", "differentiate_by_mu"),

@@ -120,8 +120,8 @@ if TYPE_CHECKING:
     from .runs.run import ProjectionRun
     from .runs.run_recipe import projector_of_run, run_recipe
     from .runs.scatter_windows import ScatterWindows
-    from .system_source import SystemSource
     from .scatter.images import ScatterImages, scatter_images
+    from .system_source import SystemSource
     from .volumes.meshes.mesh import Mesh, read_mesh, write_mesh
     from .volumes.meshes.surface import volume_to_mesh
     from .volumes.meshes.voxelization import voxelize_mesh

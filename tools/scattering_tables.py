@@ -15,7 +15,7 @@ MOMENTA = np.geomspace(0.005, 100, 100)
 
 HEAD = f"""\
 # Scattering of photons by free atoms: a line of momentum transfers x = sin(theta / 2) / wavelength, 1/angstrom; then for
-# each element its atomic weight A, its form factor F(x) and its incoherent scattering function S(x). At x = 0 they are Z and 0.
+# each element its atomic weight A, its form factor F(x) and its incoherent scattering function S(x): Z and 0 at x = 0.
 #
 # Made by tools/scattering_tables.py with xraylib {version("xraylib")} (BSD): J. H. Hubbell et al., "Atomic form factors,
 # incoherent scattering functions, and photon scattering cross sections", J. Phys. Chem. Ref. Data 4 (1975) 471-538.
@@ -29,7 +29,7 @@ def main() -> None:
         z = xraylib.SymbolToAtomicNumber(symbol)
         lines.append(f"{symbol} A {xraylib.AtomicWeight(z):.6g}")
         for letter, function in (("F", xraylib.FF_Rayl), ("S", xraylib.SF_Compt)):
-            values = (max(function(z, float(f'{x:.5g}')), 1e-7) for x in MOMENTA)  # splines end below 0
+            values = (max(function(z, float(f"{x:.5g}")), 1e-7) for x in MOMENTA)  # splines end below 0
             lines.append(f"{symbol} {letter} " + " ".join(f"{value:.4g}" for value in values))
     TABLE.write_text(HEAD + "\n".join(lines) + "\n", encoding="ascii")
 

@@ -1,7 +1,7 @@
 """Scattering of photons by materials: differential cross sections, and how much of the attenuation is scattering.
 
-Photons scatter on single atoms: by Klein and Nishina's law times the incoherent scattering function S(x), and by Thomson's law
-times the squared form factor F(x). The functions are in photon_scattering.txt; the total attenuation is `attenuation`'s.
+Photons scatter on single atoms: by Klein and Nishina's law times the incoherent scattering function S(x), and by Thomson's
+law times the squared form factor F(x). The functions are in photon_scattering.txt; the total attenuation is `attenuation`'s.
 
 References
 ----------

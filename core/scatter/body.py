@@ -43,7 +43,8 @@ class Body:
         if mu.size and mu.min() < 0:
             raise InputError(f"scatter: body: expected attenuation coefficients of 0 or more, got {mu.min():g}")
         share = np.clip((mu - water) / (bone - water), 0, 1)  # of bone
-        densities = np.stack([np.where(share < 1, (mu - share * bone) / water, 0), np.where(share < 1, share, mu / bone)], -1)
+        of_bone = np.where(share < 1, share, mu / bone)
+        densities = np.stack([np.maximum(mu - of_bone * bone, 0) / water, of_bone], axis=-1)
         filled = np.nonzero(mu > 1e-3 * water)  # air is not
         if not len(filled[0]):
             return cls(volume.grid.box((0, 0, 0), (1, 1, 1)), freeze(np.zeros((1, 1, 1, 2), np.float32)))

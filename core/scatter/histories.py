@@ -51,7 +51,7 @@ class Source:
         return cls(activity.grid, voxels, until / (whole or 1.0), float(total), np.array([energies, shares]))
 
     def starts(self, first: int, end: int, seed: int, all_first: int) -> Array:
-        """Return the photons from number `first` to `end` of those from `all_first` on, of the type `rays.backends.cpu.START`.
+        """Return the photons from number `first` to `end` of those from `all_first` on, as `rays.backends.cpu.START`.
 
         Places, directions, energies and first collisions are quasi-random: points of a Kronecker sequence that `seed` and
         `all_first` shift at random, so that each set of them is an unbiased sample of its own.
@@ -125,7 +125,17 @@ class Histories:
             body.densities, coefficients(energies), tables.incoherent, tables.coherent, tables.coherent_until,
             modules, np.ascontiguousarray(accepted, np.float32), np.ascontiguousarray(cell_of, np.int32), self.seen,
         ]  # fmt: skip  # they live as long as the jobs that point at them
-        names = ("body", "coefficients", "incoherent", "coherent", "coherent_until", "holes", "accepted", "cell_of", "seen")  # fmt: skip
+        names = [
+            "body",
+            "coefficients",
+            "incoherent",
+            "coherent",
+            "coherent_until",
+            "holes",
+            "accepted",
+            "cell_of",
+            "seen",
+        ]
         numbers = {name: array.ctypes.data for name, array in zip(names, self._arrays, strict=True)}
         step = float(energies[1] - energies[0])
         self._settings: dict[str, Any] = numbers | {
@@ -143,11 +153,10 @@ class Histories:
         modules = self._settings["modules"]
         size = -(-modules // self._threads)
         parts = [(a, min(a + size, modules)) for a in range(0, modules, size)]
-        done = 0
-        for collisions in in_order(lambda piece: self._follow(*piece, first), pieces, self._threads):
+        found = in_order(lambda piece: self._follow(*piece, first), pieces, self._threads)
+        for done, collisions in enumerate(found, 1):
             for job in collisions:
                 run_all(lambda part, job=job: self._see(job, *part), parts, self._threads)  # type: ignore[misc]
-            done += 1
             tell(progress, done, len(pieces))
         self.followed = end
 

@@ -11,6 +11,7 @@ from ..arrays import Array, Floats, Floats32
 from ..errors import InputError
 from ..geometry.grid import Grid
 from ..geometry.views import Views
+from ..memory import require
 from ..models.emission import Emission
 from ..physics.energy_window import acceptance
 from ..physics.isotopes import Window
@@ -30,7 +31,6 @@ _ENERGIES = 512  # of the tables
 _LEAST_SHARE = 1e-4  # of the photons of an energy that a window counts: below it they are not followed
 _CELL, _MOST_CELLS = 5.0, 150_000  # least side, mm, and number of the cells whose collisions a module sees as one
 _PARTS, _ROUNDS = 4, 4  # parts by whose differences deviations are known, and rounds of each for those of totals
-LEAST = 1.0
 _PILOT = 1024  # histories of a round of the trial
 
 
@@ -41,7 +41,7 @@ class ScatterImages:
     images: Floats32
     """Expected counts (W, M, n_v, n_u) of scattered photons in each window, module and pixel."""
     deviation: Floats32
-    """Standard deviations (W, M, n_v, n_u) of `images`, from four independent parts, smoothed over 5 x 5 pixels."""
+    """Standard deviations (W, M, n_v, n_u) of `images`, from parts of the histories, smoothed over 5 x 5 pixels."""
     windows: tuple[Window, ...]
     """Energy windows, keV."""
     precision: Floats
@@ -136,7 +136,9 @@ def scatter_images(
     if model.isotope is None:
         raise InputError("scatter: the model has no isotope, whose photons have energies: give isotope='Tc-99m'")
     if model.energy_fwhm is None:
-        raise InputError("scatter: the model has no energy resolution: give energy_fwhm, such as 0.1 for NaI, 0.05 for CZT")
+        raise InputError(
+            "scatter: the model has no energy resolution: give energy_fwhm, such as 0.1 for NaI, 0.05 for CZT"
+        )
     model.check(views)
     chosen = tuple(_checked_window(window) for window in (windows or [model.window]))
     run = _Run(activity, body, views, model, chosen, orders, spectra, seed_number(seed), thread_count(threads))
@@ -181,50 +183,60 @@ class _Run:
         self._modules = _modules(views, model, float(np.linalg.norm(self._cells.spacing)))
         self._sensitivity = _sensitivity(self._modules, self._cells)
         orders = strict_whole(orders, "scatter: orders", "1 or more")
+        numbers = orders * len(windows) * len(views) * (self._cells.n_voxels + 3 * math.prod(views.shape))
+        require(4.0 * numbers, f"scatter into {len(windows)} windows of {len(views)} modules")
         self._histories = Histories(
             self._body, self._source, self._modules, self._energies, self._accepted(),
             cell_of, self._cells.n_voxels, orders, seed, threads, spectra,
         )  # fmt: skip
         self._rounds: list[Floats] = []  # totals (W, M) of each round, per history
-        self._parts = np.zeros((_PARTS, orders, len(windows), len(views), *views.shape), np.float32)
-        self._count = 0  # histories of a part
+        self._counts: list[int] = []  # histories of each round
+        shape = (orders, len(windows), len(views), *views.shape)
+        self._mean, self._squares = np.zeros(shape, np.float32), np.zeros(shape[1:], np.float32)
+        self._parts, self._count = 0, 0  # numbers of parts and of their histories
         self._projectors = [self._projector(m) for m in range(len(views))]
 
     def follow_until(self, precision: float, progress: Progress | None) -> None:
         """Follow histories until all modules' totals in the first window are known to a relative `precision`."""
         self._follow_rounds(_PILOT, part_of(progress, 0, 20))
         self._histories.seen[:] = 0
-        self._modules["least"] = LEAST * np.max(np.mean(self._rounds, axis=0), axis=0)
+        self._modules["least"] = np.max(np.mean(self._rounds, axis=0), axis=0)
         needed = self._needed(_PILOT, precision)
-        self._rounds = []
+        self._rounds, self._counts = [], []
         for _ in range(3):  # the trial's deviations are not exact
             self.follow(needed, progress and (lambda done, total: progress(total + 19 * done, 20 * total)))
-            more = self._needed(self._count // _ROUNDS, precision) - self._count // _ROUNDS
+            so_far = self._count // (_PARTS * _ROUNDS)
+            more = self._needed(so_far, precision) - so_far
             if more * 8 < needed:
                 return
             needed = more
 
     def _needed(self, count: int, precision: float) -> int:
-        """Return the number of histories of a round that a precision takes, by the rounds of `count` histories so far."""
+        """Return the number of histories of each of 16 rounds that a precision takes, by those of `count` so far."""
         error = float(self._errors()[0].max(initial=0.0))
         return max(math.ceil(count * min((error / precision) ** 2, 1e4)), 16)
 
     def _errors(self) -> Floats:
         """Return the relative standard deviations (W, M) of the modules' totals, by the differences of rounds."""
-        rounds = np.array(self._rounds)
-        mean = rounds.mean(axis=0)
-        error = rounds.std(axis=0, ddof=1) / math.sqrt(len(rounds))
+        counts, rounds = np.array(self._counts, float), np.array(self._rounds)
+        mean = np.average(rounds, axis=0, weights=counts)
+        squares = np.average((rounds - mean) ** 2, axis=0, weights=counts)
+        error = np.sqrt(squares / (len(rounds) - 1))
         return np.divide(error, mean, out=np.zeros_like(mean), where=mean > 0)
 
     def follow(self, count: int, progress: Progress | None) -> None:
-        """Follow `count` histories in each round of each part, and add their images to those of the parts."""
+        """Follow `count` histories in each round of some parts, and add these to the mean image and its variance.
+
+        By D. H. D. West, Communications of the ACM 22 (1979) 532, with the histories of a part as its weight.
+        """
         new = _ROUNDS * count
         for k in range(_PARTS):
             self._follow_rounds(count, part_of(progress, k, _PARTS), _ROUNDS)
-            images = self._project(self._histories.seen)
-            self._parts[k] += (images / new - self._parts[k]) * (new / (self._count + new))
+            off = self._project(self._histories.seen) / new - self._mean
             self._histories.seen[:] = 0
-        self._count += new
+            self._parts, self._count = self._parts + 1, self._count + new
+            self._mean += off * (new / self._count)
+            self._squares += off.sum(axis=0) ** 2 * (new * (1 - new / self._count))
 
     def _follow_rounds(self, count: int, progress: Progress | None, rounds: int = _PARTS * _ROUNDS) -> None:
         """Follow rounds of `count` histories, and keep their totals."""
@@ -233,12 +245,13 @@ class _Run:
             self._histories.run(count, part_of(progress, k, rounds))
             total = np.einsum("owcm,cm->wm", self._histories.seen, self._sensitivity)
             self._rounds.append((total - before) / count)
+            self._counts.append(count)
             before = total
 
     def _project(self, seen: Array) -> Array:
         """Return the images (orders, W, M, n_v, n_u) of what the modules saw, for one history."""
         scale = self._source.photons / self._cells.voxel_volume
-        images = np.empty(self._parts.shape[1:], np.float32)
+        images = np.empty(self._mean.shape, np.float32)
 
         def project(m: int) -> None:
             for order, window in np.ndindex(images.shape[:2]):
@@ -251,18 +264,17 @@ class _Run:
 
     def result(self) -> ScatterImages:
         """Return the images, whose spectra are those of all histories."""
-        total = self._parts.sum(axis=1)  # over orders
-        variance = total.var(axis=0, ddof=1) / _PARTS
+        variance = self._squares / ((self._parts - 1) * self._count)
         histories = self._histories.followed
         spectra = self._histories.spectra
         scale = self._source.photons / histories * np.broadcast_to(self._model.effective_time, len(self._views))
         return ScatterImages(
-            images=freeze(total.mean(axis=0)),
+            images=freeze(self._mean.sum(axis=0)),
             deviation=freeze(np.sqrt(_smoothed(variance))),
             windows=self._windows,
             precision=freeze(self._errors()),
             histories=histories,
-            by_order=freeze(self._parts.mean(axis=0)) if len(self._parts[0]) > 1 else None,
+            by_order=freeze(self._mean) if len(self._mean) > 1 else None,
             energies=None if spectra is None else freeze(self._energies),
             spectra=None if spectra is None else freeze(spectra * scale[:, None]),
         )

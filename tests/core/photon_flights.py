@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from math import erf
 
 import numpy as np
+
 from mphdrr.core.physics.photon_scattering import Scatterer
 
 ELECTRON = 510.99895
@@ -40,7 +41,7 @@ def sphere(n, rng):
 
 
 def left(density, spacing, places, energies, rng, lowest=30.0):
-    """Return the photons that leave a cubic grid, centred, of water's densities, of those that begin at places to all sides."""
+    """Return the photons that leave voxels of water, centred, of those that begin at `places` to all sides."""
     n, half = np.array(density.shape), np.array(density.shape) * spacing / 2
     directions, orders, gone = sphere(len(places), rng), np.zeros(len(places), int), []
     most = density.max()

@@ -92,12 +92,11 @@ class PhotonJob(Structure):
         ("is_double", c_int64), ("body", c_void_p), ("n", c_int64 * 3), ("index_from_world", c_double * 12),
         ("energies", c_int64), ("lowest", c_double), ("energies_per_kev", c_double), ("coefficients", c_void_p),
         ("momenta", c_int64), ("momenta_per_root", c_double), ("incoherent", c_void_p), ("coherent", c_void_p),
-        ("coherent_until", c_void_p), ("seed", c_uint64), ("all_first", c_int64), ("first", c_int64), ("last", c_int64),
-        ("starts", c_void_p),
-        ("collisions", c_void_p), ("capacity", c_int64), ("followed", c_void_p), ("n_collisions", c_void_p), ("holes", c_void_p),
-        ("modules", c_int64), ("first_module", c_int64), ("last_module", c_int64), ("accepted", c_void_p),
-        ("windows", c_int64), ("orders", c_int64), ("cell_of", c_void_p), ("cells", c_int64), ("seen", c_void_p),
-        ("spectra", c_void_p),
+        ("coherent_until", c_void_p), ("seed", c_uint64), ("all_first", c_int64), ("first", c_int64),
+        ("last", c_int64), ("starts", c_void_p), ("collisions", c_void_p), ("capacity", c_int64),
+        ("followed", c_void_p), ("n_collisions", c_void_p), ("holes", c_void_p), ("modules", c_int64),
+        ("first_module", c_int64), ("last_module", c_int64), ("accepted", c_void_p), ("windows", c_int64),
+        ("orders", c_int64), ("cell_of", c_void_p), ("cells", c_int64), ("seen", c_void_p), ("spectra", c_void_p),
     ]  # fmt: skip
 
 

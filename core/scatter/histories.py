@@ -58,9 +58,9 @@ class Source:
         """
         from ..rays.backends.cpu import START
 
-        shift = np.random.default_rng([seed, all_first]).random(len(_STEPS))
+        shift = np.random.default_rng([seed, all_first, 1]).random(len(_STEPS))
         shares = (np.arange(first - all_first, end - all_first)[:, None] * _STEPS + shift) % 1
-        inside = np.random.default_rng([seed, all_first, first]).random((end - first, 3)) - 0.5
+        inside = np.random.default_rng([seed, first, 2]).random((end - first, 3)) - 0.5
         if not len(self.voxels):
             return np.empty(0, START)
         voxels = self.voxels[np.minimum(np.searchsorted(self.until, shares[:, 0], side="right"), len(self.voxels) - 1)]

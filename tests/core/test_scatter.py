@@ -102,7 +102,7 @@ def test_first_collisions_are_an_integral_over_the_body():
     system = mph.PinholeSystem(np.array([[0.0, 0.0, 200.0]]), 1.0, 60.0, 200.0, 9.0, 75.0)
     views, optics, place = system.views((40, 40), "real"), model(system, tolerance=0.002), np.array([6.0, 4.0, -3.0])
     found = mph.scatter_images(
-        point(place), water(grid), views, optics, windows=[WINDOWS[0]], orders=2, histories=400_000
+        point(place), water(grid), views, optics, windows=[WINDOWS[0]], orders=2, histories=1_600_000
     )
     u = (np.arange(400) + 0.5) / 400
     cosine, azimuth, step = np.meshgrid(2 * u - 1, 2 * np.pi * u[::2], (np.arange(60) + 0.5) / 60, indexing="ij")
@@ -160,9 +160,10 @@ def compare(found, counts, variances):
         sd = np.sqrt(variances[w].sum(axis=(1, 2)) + (found.precision[w] * images.sum(axis=(1, 2))) ** 2)
         deviations = (images.sum(axis=(1, 2)) - counts[w].sum(axis=(1, 2))) / sd
         assert 0.4 < (deviations**2).mean() < 1.8, deviations
-    first, spread = found.images[0], variances[0] + found.deviation[0] ** 2
-    enough = variances[0] > np.quantile(variances[0], 0.5)  # pixels with many photons
-    chi2 = ((first - counts[0]) ** 2 / np.where(spread > 0, spread, 1))[enough].mean()
+    first, weight = found.images[0], variances[0].sum() / counts[0].sum()  # of a photon that flew
+    enough = first > 8 * weight
+    spread = first * weight + found.deviation[0] ** 2
+    chi2 = ((first - counts[0]) ** 2 / np.where(enough, spread, 1))[enough].mean()
     assert 0.7 < chi2 < 1.3, chi2
 
 

@@ -125,17 +125,10 @@ class Histories:
             body.densities, coefficients(energies), tables.incoherent, tables.coherent, tables.coherent_until,
             modules, np.ascontiguousarray(accepted, np.float32), np.ascontiguousarray(cell_of, np.int32), self.seen,
         ]  # fmt: skip  # they live as long as the jobs that point at them
-        names = [
-            "body",
-            "coefficients",
-            "incoherent",
-            "coherent",
-            "coherent_until",
-            "holes",
-            "accepted",
-            "cell_of",
-            "seen",
-        ]
+        names = (
+            *("body", "coefficients", "incoherent", "coherent", "coherent_until"),
+            *("holes", "accepted", "cell_of", "seen"),
+        )
         numbers = {name: array.ctypes.data for name, array in zip(names, self._arrays, strict=True)}
         step = float(energies[1] - energies[0])
         self._settings: dict[str, Any] = numbers | {
@@ -166,9 +159,9 @@ class Histories:
         found = self._follow(first, self.followed, first)
         return np.concatenate([arrays[0][: arrays[1][1]] for _, arrays in found])
 
-    def _follow(self, first: int, end: int, all_first: int) -> list[tuple[Any, Array]]:
+    def _follow(self, first: int, end: int, all_first: int) -> list[tuple[Any, tuple[Array, ...]]]:
         """Return the collisions of the histories from `first` to `end`, as jobs for `_see` with their arrays."""
-        found = []
+        found: list[tuple[Any, tuple[Array, ...]]] = []
         starts = self._source.starts(first, end, self._settings["seed"], all_first)
         end = first + len(starts)  # none where nothing is active
         begins = first

@@ -140,7 +140,7 @@ def scatter_images(
             "scatter: the model has no energy resolution: give energy_fwhm, such as 0.1 for NaI, 0.05 for CZT"
         )
     model.check(views)
-    chosen = tuple(_checked_window(window) for window in (windows or [model.window]))
+    chosen = tuple(_checked_window(window) for window in windows or (model.window,))
     run = _Run(activity, body, views, model, chosen, orders, spectra, seed_number(seed), thread_count(threads))
     if histories is not None:
         count = strict_whole(histories, "scatter: histories", "1 or more")
@@ -340,7 +340,7 @@ def _optics_ratio(model: Emission, energies: Floats) -> Floats:
 def _crystal_of(model: Emission, mu: float) -> str:
     """Return the crystal that has this coefficient at the model's lines; "" if none has."""
     arguments = model.photon_lines, model.system, model.optics.opening_angle
-    found = (name for name in CRYSTALS if np.any(np.equal(module_coefficients(None, name, *arguments)[1], mu)))
+    found = (name for name in CRYSTALS if module_coefficients(None, name, *arguments)[1] == mu)
     return next(found, "")
 
 
@@ -350,11 +350,12 @@ def _cells(grid: Grid) -> tuple[Array, Grid]:
     while np.prod(shape := -(-np.array(grid.shape) // steps)) > _MOST_CELLS:
         steps[np.argmin(steps * grid.spacing)] += 1
     i, j, k = (np.arange(n) // step for n, step in zip(grid.shape, steps, strict=True))
-    numbers = np.ravel_multi_index(np.ix_(i, j, k), shape)
+    n_x, n_y, n_z = (int(n) for n in shape)
+    numbers = np.asarray(np.ravel_multi_index(np.ix_(i, j, k), (n_x, n_y, n_z)))
     affine = grid.affine.copy()
     affine[:3, :3] *= steps
     affine[:3, 3] += grid.affine[:3, :3] @ ((steps - 1) / 2)
-    return numbers, Grid(tuple(int(n) for n in shape), affine)
+    return numbers, Grid((n_x, n_y, n_z), affine)
 
 
 def _modules(views: Views, model: Emission, cell: float) -> Array:

@@ -5,13 +5,14 @@ from typing import Any
 import bpy
 from bpy.props import EnumProperty, IntProperty
 
-from ..addon.blender import file_properties, jobs, storage
+from ..addon.blender import choices, file_properties, jobs, storage
 from ..addon.blender.reports import Need, Reported, ask_to_remove, needs
 from ..addon.pictures import images
 from ..addon.runs import rendering, runs
 from ..core import InputError, Progress, read_run
 from ..core.runs.comparing import difference, difference_sheet
 from ..core.runs.flood_files import write_flood
+from ..core.runs.run import PHOTONS
 
 _choices: list[tuple[str, str, str]] = []  # kept here, because Blender keeps no copies of an enumeration's texts
 
@@ -35,10 +36,13 @@ class MPHDRR_OT_show_run(jobs.JobOperator, bpy.types.Operator):
     poll = needs(_LISTED)
 
     index: IntProperty(name="Index", description="Place of the run in the list, from 0", min=0, options={"SKIP_SAVE"})
+    photons: EnumProperty(name="Photons", description="Photons that the images hold, of a run with scatter",
+                          items=choices.items({}, ((name.upper(), label, "") for name, label in PHOTONS.items())),
+                          default="ALL", options={"SKIP_SAVE"})  # fmt: skip
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
         _required_run(context.scene, self.index)
-        return rendering.show_run_job(context.scene, self.index)
+        return rendering.show_run_job(context.scene, self.index, self.photons.lower())
 
 
 class MPHDRR_OT_remove_run(Reported, bpy.types.Operator):

@@ -83,6 +83,7 @@ class MPHDRR_PT_physics(Popover, bpy.types.Panel):
             column.prop(settings, "mu", placeholder="None")
         physics = (setting for setting in panel_properties(settings, "model") if setting[0] in _PHYSICS)
         layouts.draw_settings(column, settings, physics)
+        layouts.draw_settings(column, settings, panel_properties(settings, "scatter"))
         row = layout.row(heading="Poisson Noise")
         row.active = makes_counts(settings)
         row.prop(settings, "noise", text="")

@@ -49,6 +49,11 @@ class _RunsPanel:
             column.label(text=line)
         row = layouts.invoking(layout.row(align=True))
         row.operator("mphdrr.show_projections", text="Show Mosaic", icon="IMAGE_DATA")
+        row = layouts.invoking(layout.row(align=True))
+        row.enabled = not jobs.is_running()
+        for part, label, is_shown in runs.parts_to_show(context.scene):
+            button = row.operator("mphdrr.show_run", text=label, depress=is_shown)
+            button.index, button.photons = settings.active_run, part
         if len(settings.runs) > 1:
             column.label(text=iface("All runs: {size}").format(size=runs.file_size_text(settings.runs)))
             row = row.row(align=True)

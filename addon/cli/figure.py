@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from ... import core as mph
-from ...core.cli.options import add_command, output_path, progress_bar, refuse
+from ...core.cli.options import add_command, add_photons, output_path, progress_bar, refuse
 from ...core.figures.kinds import FILMS, KINDS, PAPERS, SAMPLES, FigureKind, Rendering, figure_kind
 from ...core.figures.page import SUFFIXES, Page
 from ...core.figures.subject import NEEDS, FigureSubject, require
@@ -59,6 +59,7 @@ def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
     add("--style", choices=list(PAPERS), default="dark", help="of figures that are rendered")
     add("--seconds", type=float, default=Rendering().seconds, metavar="S", help="how long an animation is")
     add("--fps", type=int, default=Rendering().fps, metavar="N", help="pictures of an animation per second")
+    add_photons(parser)
     parser.set_defaults(run=_run)
 
 
@@ -165,7 +166,7 @@ def _read_file(arguments: argparse.Namespace, file: str, scanner: Any) -> dict[s
         return {"scanner": mph.read_scanner(file, next(iter(mph.kinds_in(file)), "pinhole"))}
     if suffix == ".toml" and "shape" not in read_toml(file):
         (run,) = mph.run_recipe(mph.read_recipe(file), scanner, stages=progress_bar)
-        return _run_values(run)
+        return _run_values(run.of_photons(arguments.photons))
     kinds = [kind for kind in PHANTOMS if kind.name == file]
     if kinds or suffix == ".toml":
         phantom: Any = kinds[0].phantom(**kinds[0].usual) if kinds else mph.read_phantom(file)
@@ -178,10 +179,12 @@ def _read_file(arguments: argparse.Namespace, file: str, scanner: Any) -> dict[s
         return {"volume": volume, "pose": pose, "name": phantom.title, "posed": True}
     if suffix in FORMATS:
         try:
-            return _run_values(mph.read_run(file))
+            run = mph.read_run(file)
         except mph.InputError:
             if suffix == ".pt" or not Path(file).is_file():
                 raise
+        else:
+            return _run_values(run.of_photons(arguments.photons))
     return {"volume": mph.read_volume(file), "pose": None, "name": Path(file).name}
 
 

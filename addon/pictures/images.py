@@ -35,6 +35,7 @@ _EDITOR_SHARE = 0.4  # share of the 3D view's height for an Image Editor that is
 _WAIT = 0.005  # s between two checks of a worker thread
 _SCANNER = "mphdrr_scanner"  # custom property of the mosaic: the collection of the run's scanner
 _TEXT = "mphdrr_difference"  # custom property of a difference: its numbers, in words
+PHOTONS = "mphdrr_photons"  # custom property of the mosaic: its part of the photons, see `core.runs.run.PHOTONS`
 _LABELS = "mphdrr_labels"  # custom property of the mosaic: the label of each tile, line by line
 _TILES = "mphdrr_tiles"  # custom property of the mosaic: its modules, its unit, and the position of each tile
 _VIEWS = "mphdrr_views"  # custom property of the mosaic: the run's views, as arrays of `Views`, and their ROI radii

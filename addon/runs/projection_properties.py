@@ -27,10 +27,11 @@ USUAL_TIME = 600.0
 """Duration, s, of a cardiac acquisition: the panel's time when a preset or a volume makes it simulate counts."""
 
 _NAMES = {"model.kind": "model", "detector.plane": "detector", "detector.rows": "height", "detector.columns": "width",
-          "frames.times": "frame_times", "frames.starts": "frame_starts"}  # fmt: skip
+          "frames.times": "frame_times", "frames.starts": "frame_starts", "scatter.model": "scatter",
+          "scatter.precision": "scatter_precision", "scatter.seed": "scatter_seed"}  # fmt: skip
 """Names of properties in .blend files that differ from the names of their settings."""
 
-_TABLES = ("system.modules", "model.", "detector.", "frames.", "compute.")
+_TABLES = ("system.modules", "model.", "scatter.", "detector.", "frames.", "compute.")
 PROPERTIES = {
     _NAMES.get(key, key.partition(".")[2]): setting
     for key, setting in SETTINGS.items()

@@ -249,15 +249,15 @@ def show_planes(scene: bpy.types.Scene, run: ProjectionRun, collection: bpy.type
     recoloring.check()  # the display may have been edited since the pictures were made
 
 
-def show_run_job(scene: bpy.types.Scene, index: int) -> jobs.Job:
-    """Return the job that shows a run of the scene's list."""
+def show_run_job(scene: bpy.types.Scene, index: int, photons: str = "all") -> jobs.Job:
+    """Return the job that shows a run of the scene's list; `photons` is one of `core.runs.run.PHOTONS`."""
     item = scene.mphdrr_projections.runs[index]
     uid, name, file, path = scene.session_uid, item.name, item.file, run_file_path(item.file)
     display = scene.mphdrr_display.display()
 
     def work(progress: Progress) -> tuple[ProjectionRun, images.Pictures]:
         """Read the run, and return it with its pictures."""
-        run = read_run(path)
+        run = read_run(path).of_photons(photons)
         return run, images.make_pictures(run, display, stages_of(progress)("packing"))
 
     def finish(result: tuple[ProjectionRun, images.Pictures]) -> jobs.Finishing:
@@ -270,8 +270,9 @@ def show_run_job(scene: bpy.types.Scene, index: int) -> jobs.Job:
         index = files.index(file)
         owner = scene.mphdrr_projections.runs[index].scanner
         images.show((yield from show_images(scene, run, owner, pictures)), bpy.context)
+        bpy.data.images[ids.MOSAIC][images.PHOTONS] = photons
         runs.mark_shown(scene, index)
-        return f"Shown: {name}"
+        return f"Shown: {name}" + ("" if photons == "all" else f", {photons} photons")
 
     return jobs.Job("Showing a run", work, finish)
 

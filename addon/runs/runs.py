@@ -18,10 +18,11 @@ from ...core.geometry.scanner import Scanner
 from ...core.memory import readable_size
 from ...core.recipes.settings import Setting
 from ...core.runs.recipe import Recipe, fitting_recipe
-from ...core.runs.run import ProjectionRun
+from ...core.runs.run import PHOTONS, ProjectionRun
 from ...core.runs.settings import SAMPLING, SETTINGS
 from ..blender import decimals, ids, objects, reports, storage, timers, windows
 from ..phantoms import phantoms
+from ..pictures import images
 from ..scanner import following, module_values, scanner, scanner_parts
 from ..volumes import volumes
 from .projection_properties import OPENING_ANGLE, settings_recipe
@@ -34,7 +35,7 @@ _PAUSE = 0.3  # s from a change of the scene until the runs are compared with it
 _DEFAULTS = {
     key: setting.default
     for key, setting in SETTINGS.items()
-    if key.startswith(("model.", "detector.")) or key in ("noise.seed", "system.modules")
+    if key.startswith(("model.", "scatter.", "detector.")) or key in ("noise.seed", "system.modules")
 }
 """Defaults of the settings on which a run's numbers depend."""
 
@@ -138,6 +139,14 @@ def holds_counts(scene: bpy.types.Scene) -> bool | None:
     """Return whether the shown run holds SPECT counts; None where that is not known."""
     settings = run_settings(scene)
     return settings["model.kind"] == "emission" if settings else None
+
+
+def parts_to_show(scene: bpy.types.Scene) -> list[tuple[str, str, bool]]:
+    """Return identifier and label of each part of the shown run's photons, and whether it is shown; none without scatter."""
+    if run_settings(scene).get("scatter.model", "none") == "none" or ids.MOSAIC not in bpy.data.images:
+        return []
+    shown = bpy.data.images[ids.MOSAIC].get(images.PHOTONS, "all")
+    return [(part.upper(), label, part == shown) for part, label in PHOTONS.items()]
 
 
 def required_run(scene: bpy.types.Scene, action: str) -> bpy.types.PropertyGroup:

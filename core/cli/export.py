@@ -5,7 +5,7 @@ import argparse
 from ... import core as mph
 from ..runs import EXPORT_FORMATS, FORMATS
 from ..runs.mosaic import write_sheet
-from .options import add_run, output_path
+from .options import add_photons, add_run, output_path
 
 
 def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
@@ -16,6 +16,7 @@ def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
     output = f"{formats}, or the counts alone as .dcm; may be repeated"
     add("-o", "--output", action="append", default=[], metavar="FILE", help=output)
     add("--mosaic", metavar="PNG", help="all images in one picture")
+    add_photons(parser)
 
 
 def _run(arguments: argparse.Namespace) -> None:
@@ -25,7 +26,7 @@ def _run(arguments: argparse.Namespace) -> None:
     """
     if not arguments.output and not arguments.mosaic:
         raise mph.InputError("nothing to write: give --output FILE or --mosaic PNG")
-    run = mph.read_run(arguments.file)
+    run = mph.read_run(arguments.file).of_photons(arguments.photons)
     paths = [output_path(name, EXPORT_FORMATS) for name in arguments.output]
     picture = output_path(arguments.mosaic) if arguments.mosaic else None
     for path in paths:

@@ -141,6 +141,12 @@ def expand_to_three(values: list) -> list:
     return values * 3 if len(values) == 1 else values
 
 
+def add_photons(parser: argparse.ArgumentParser) -> None:
+    """Add the option that chooses photons of a run with scatter."""
+    parser.add_argument("--photons", choices=("all", "primary", "scatter"), default="all",
+                        help="which photons the images hold, of a run with scatter")  # fmt: skip
+
+
 def output_path(text: str, suffixes: tuple[str, ...] = (), is_new: bool = True) -> Path:
     """Return the path of a file to write, whose name must end in one of `suffixes` if any are given.
 

@@ -155,7 +155,7 @@ class EventMaker:
         if recipe["attenuation.of_phantom"]:
             self._check_mu(planned, imaging.model)
             mu = self._voxelize(planned, "mu").array
-        images = imaging.images(truth, mu)
+        images = imaging.images(truth, mu, number=planned.number)
         if imaging.model.has_times and self.recipe["augmentation.module_gain"]:
             images *= gains.astype(np.float32)[:, None, None]
         return images, imaging.unit(truth)

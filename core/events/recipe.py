@@ -244,7 +244,11 @@ class EventRecipe:
     def _model_recipe(self, entries: dict[str, Any]) -> Recipe:
         """Return the recipe of projection runs of one table [models.NAME]; `InputError` where it does not fit the truth."""
         attenuation, energy = entries.pop("attenuation", None), entries.pop("attenuation_energy", None)
+        scatter = entries.pop("scatter", {})
+        if not isinstance(scatter, dict):
+            raise InputError(f'scatter: expected scatter.model = "body", got scatter = {scatter!r}')
         values = dict(self.system.given) | {f"model.{key}": value for key, value in entries.items()}
+        values |= {f"scatter.{key}": value for key, value in scatter.items()}
         if attenuation == "phantom":
             values["attenuation.of_phantom"] = True
         elif attenuation is not None:

@@ -83,6 +83,7 @@ _VOLUME = ("volume/array", "volume/affine")
 """Names of the volume's arrays, which a file of a measured run does not have."""
 _BACKGROUND = "background"  # in the unit of the projections; 0 if the array is missing
 _EFFICIENCY = "efficiency"  # 1 if the array is missing
+_SCATTER = "scatter"  # counts of scattered photons in the projections; not simulated if the array is missing
 _ATTRIBUTES, _SHA256 = "attributes", "sha256"
 _COMPRESS_FROM = 1 << 16  # bytes; smaller arrays are not worth compressing
 
@@ -133,6 +134,8 @@ def _run_arrays(run: ProjectionRun) -> _Arrays:
         arrays[_BACKGROUND] = (run.unit, np.asarray(run.background))
     if np.any(np.asarray(run.efficiency) != 1):
         arrays[_EFFICIENCY] = ("", np.asarray(run.efficiency))
+    if run.scatter is not None:
+        arrays[_SCATTER] = (run.unit, run.scatter)
     return arrays
 
 
@@ -177,6 +180,7 @@ def _build_run(arrays: dict[str, Array], attributes: dict[str, Any]) -> Projecti
         versions=json.loads(attributes["versions"]),
         background=arrays.get(_BACKGROUND, 0.0),  # type: ignore[arg-type]  # checked by `ProjectionRun`
         efficiency=arrays.get(_EFFICIENCY, 1.0),  # type: ignore[arg-type]
+        scatter=arrays.get(_SCATTER),
     )
 
 

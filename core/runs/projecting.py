@@ -16,6 +16,7 @@ from ..physics.isotopes import photon_energy
 from ..physics.noise import sample_counts
 from ..progress import Progress
 from ..projector import Model, Projector, intensity
+from ..scatter.images import scatter_images, scattering_body
 from ..validation import positive, seed_number
 from ..volumes.volume import Volume
 from .counting import scale_by_module
@@ -23,6 +24,16 @@ from .run import ProjectionRun
 
 LINES = "lines"
 """Word in place of the energy at which CT numbers become mu: they attenuate each line of the isotope at its own energy."""
+
+
+@dataclass(frozen=True)
+class BodyScatter:
+    """Simulation of the photons that the attenuating body scatters, see `scatter_images`."""
+
+    precision: float = 0.005
+    """Relative standard deviation of each module's total."""
+    seed: int = 0
+    """Seed of the random numbers."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,17 +48,46 @@ class Imaging:
     """Photons per pixel of an X-ray source, see `project_run`."""
     dead_time: tuple[float, str] = (0.0, "non-paralysable")
     """Dead time of each module, s, and its kind."""
+    scatter: BodyScatter | None = None
+    """Simulation of scattered photons; None leaves them out."""
+
+    def __post_init__(self) -> None:
+        if self.scatter is not None:
+            scattering_body(cast(Any, self.model))  # or raises
 
     @property
     def model(self) -> Model:
         """Model of the images."""
         return self.projector.model
 
-    def images(self, volume: Volume, mu: Floats32 | None = None, progress: Progress | None = None) -> Floats32:
-        """Return the expected images (M, n_v, n_u) of a volume, with the background and the losses by dead time."""
+    def images(
+        self, volume: Volume, mu: Floats32 | None = None, progress: Progress | None = None, number: int = 0
+    ) -> Floats32:
+        """Return the expected images (M, n_v, n_u) of a volume, with background, scatter and the losses by dead time.
+
+        The seed of the scatter is that of `scatter` and `number` added.
+        """
         images = self.expected(volume, mu, progress)
+        if (scattered := self.scattered(volume, mu, progress, number)) is not None:
+            images += scattered
         images *= self.recorded_shares(images)
         return images
+
+    def scattered(
+        self, volume: Volume, mu: Floats32 | None = None, progress: Progress | None = None, number: int = 0
+    ) -> Floats32 | None:
+        """Return the expected images (M, n_v, n_u) of the photons that the body scatters; None where they are left out.
+
+        The arguments are those of `images`.
+        """
+        if self.scatter is None:
+            return None
+        model: Any = self.model
+        body = scattering_body(model) if mu is None else Volume(mu, volume.grid, "mu")
+        precision, seed = self.scatter.precision, self.scatter.seed + number
+        return scatter_images(
+            volume, body, self.projector.views, model, precision=precision, seed=seed, progress=progress
+        ).images[0]
 
     def recorded_shares(self, images: Floats32) -> Floats32:
         """Return the fractions (M, 1, 1) of expected `images` (M, n_v, n_u) that the modules record despite their dead time.
@@ -113,6 +153,7 @@ def project_run(
     progress: Progress | None = None,
     dead_time: tuple[float, str] = (0.0, "non-paralysable"),
     noise: str = "poisson",
+    scatter: BodyScatter | None = None,
 ) -> ProjectionRun:
     """Project `volume` into every module of `system`.
 
@@ -140,6 +181,8 @@ def project_run(
         expected counts, before noise is drawn (`dead_time_counts`), and the run's background.
     noise
         Model of the noise, see `sample_counts`.
+    scatter
+        Simulation of the photons that the model's mu scatters, for an `Emission` with an isotope and `energy_fwhm`.
 
     Raises
     ------
@@ -155,9 +198,12 @@ def project_run(
     n_v, n_u = views.shape
     bytes_per_pixel = 4.0 if noise_seed is None else 20.0  # counts are drawn from float64, as int64
     require(bytes_per_pixel * len(views) * n_v * n_u, f"a set of {len(views)} projections of {n_v} x {n_u} pixels")
-    imaging = Imaging(Projector(volume.grid, views, model, backend, threads), photons, dead_time)
+    imaging = Imaging(Projector(volume.grid, views, model, backend, threads), photons, dead_time, scatter)
     model = imaging.model
     images = imaging.expected(volume, progress=progress)
+    scattered = imaging.scattered(volume, progress=progress)
+    if scattered is not None:
+        images += scattered
     shares = imaging.recorded_shares(images)
     images *= shares
     if noise_seed is not None:
@@ -168,7 +214,8 @@ def project_run(
         **({} if photons is None else {"photons": photons}), "backend": imaging.projector.backend, **(settings or {}),
     }  # fmt: skip
     return ProjectionRun(images, system, views, volume, unit=imaging.unit(volume), settings=record, seed=noise_seed,
-                         background=scale_by_module(model.background, shares), efficiency=model.efficiency)  # fmt: skip
+                         background=scale_by_module(model.background, shares), efficiency=model.efficiency,
+                         scatter=None if scattered is None else scattered * shares)  # fmt: skip
 
 
 def warn_of_energy(model: Model, energy: float | str | None, source: str) -> None:

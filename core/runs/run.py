@@ -3,7 +3,7 @@
 import contextlib
 import platform
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from importlib import metadata
 from typing import Any
 
@@ -14,7 +14,7 @@ from ..errors import InputError
 from ..geometry.scanner import Scanner
 from ..geometry.views import Views
 from ..models.model import checked_background
-from ..validation import freeze, real_numbers
+from ..validation import freeze, one_of, real_numbers
 from ..version import VERSION
 from ..volumes.volume import Volume
 from .recipe import Recipe, recipe_from_tables
@@ -30,6 +30,10 @@ def versions() -> dict[str, str]:
 
         numbers["cpu"] = cpu.levels()[cpu.level]
     return numbers
+
+
+PHOTONS = {"all": "All", "primary": "Primary", "scatter": "Scatter"}
+"""Parts of a run's images by the photons in them, see `ProjectionRun.of_photons`, with their labels."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,6 +67,8 @@ class ProjectionRun:
     """Expected counts besides the volume's: one number, one for each module (M,), or images (M, n_v, n_u)."""
     efficiency: float | Floats = 1.0
     """Detection efficiency of the pixels, in one of the same forms."""
+    scatter: Floats32 | None = None
+    """Expected counts (M, n_v, n_u) of simulated scattered photons in `projections`; None where none were simulated."""
 
     def __post_init__(self) -> None:
         self.views.require_pinholes("run")
@@ -75,6 +81,10 @@ class ProjectionRun:
         for form in ("background", "efficiency"):
             values = checked_background(getattr(self, form), f"run: {form}", len(self.views), self.views.shape)
             object.__setattr__(self, form, values)
+        if self.scatter is not None:
+            name = "run: scatter"
+            scatter = checked(real_numbers(self.scatter, name), name, shape, False)
+            object.__setattr__(self, "scatter", freeze(scatter.view()))
         if not self.unit:
             if self.volume is None:
                 raise InputError("run: without a volume, say the unit of the projections, such as counts")
@@ -94,6 +104,19 @@ class ProjectionRun:
         if "recipe" not in self.settings:
             raise InputError("the run holds no recipe: give its model, as by --set model.kind=emission or --recipe")
         return recipe_from_tables(self.settings["recipe"], recorded=True)
+
+    def of_photons(self, part: str) -> "ProjectionRun":
+        """Return the run with the images of one of `PHOTONS` alone: "scatter", or "primary" with all else.
+
+        Of drawn counts primary is what remains without the expected scatter. Raises `InputError` for a run without scatter.
+        """
+        one_of(part, PHOTONS, "photons")
+        if part == "all":
+            return self
+        if self.scatter is None:
+            raise InputError(f"photons = {part}: the run holds no scatter; make it with --scatter body")
+        images = self.scatter if part == "scatter" else self.projections - self.scatter
+        return replace(self, projections=images, scatter=None)
 
     def intrinsics(self) -> Floats:
         """Return the camera matrices K (M, 3, 3), pixels: ``K @ (x_u, x_v, x_k)`` is a multiple of ``(column, row, 1)``.

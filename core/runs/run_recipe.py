@@ -28,7 +28,7 @@ from ..phantoms.settings import setting_names
 from ..physics.ct_numbers import hu_to_mu
 from ..physics.isotopes import photon_energy
 from ..physics.noise import NOISE_MODELS
-from ..progress import Progress, Stages
+from ..progress import Progress, StagedProgress, Stages
 from ..projector import Model, Projector
 from ..volumes.rearranging import centered
 from ..volumes.volume import Volume
@@ -38,7 +38,7 @@ from ..xray.detectors import checked_bins
 from .counting import recipe_dead_time, recipe_efficiency, recorded_shares, scale_by_module
 from .measured import recipe_counts
 from .model_kinds import model_class
-from .projecting import LINES, Imaging, project_run, warn_of_energy
+from .projecting import LINES, BodyScatter, Imaging, project_run, warn_of_energy
 from .recipe import Recipe, recorded_recipe
 from .run import ProjectionRun
 from .settings import SETTINGS
@@ -106,12 +106,15 @@ def run_recipe(
         record, seed = record.updated(times), recipe["noise.seed"]
         if seed is not None:  # each run has its own noise
             record = record.updated({"noise.seed": seed + number})
+        if (scatter := recipe_scatter(recipe)) is not None and number:  # and its own scatter
+            scatter = replace(scatter, seed=scatter.seed + number)
+            record = record.updated({"scatter.seed": scatter.seed})
         yield project_run(
             system, source, **_view_arguments(recipe), backend=recipe["compute.backend"], threads=recipe["compute.threads"],
             settings={"volume": _volume_name(record), **converted, "recipe": record.tables()},
             model=recipe_model(recipe.updated(times), system, mu_of_it), photons=recipe["model.photons"],
-            noise_seed=record["noise.seed"], progress=stages("projecting"), dead_time=recipe_dead_time(recipe),
-            noise=recipe.choice("noise.model", NOISE_MODELS),
+            noise_seed=record["noise.seed"], dead_time=recipe_dead_time(recipe), scatter=scatter,
+            noise=recipe.choice("noise.model", NOISE_MODELS), progress=StagedProgress(stages, "projecting"),
         )  # fmt: skip
 
 
@@ -273,7 +276,16 @@ def recipe_imaging(
 ) -> Imaging:
     """Return the simulator of a recipe's images of volumes on a grid, with `mu` as attenuation."""
     projector = Projector(grid, views, recipe_model(recipe, system, mu), threads=threads)
-    return Imaging(projector, recipe["model.photons"], recipe_dead_time(recipe))
+    return Imaging(projector, recipe["model.photons"], recipe_dead_time(recipe), recipe_scatter(recipe))
+
+
+def recipe_scatter(recipe: Recipe) -> BodyScatter | None:
+    """Return the simulation of scatter that a recipe names; raise `InputError` if the recipe lacks what it takes."""
+    if recipe["scatter.model"] == "none":
+        return None
+    if missing := [key for key in ("model.isotope", "model.energy_fwhm") if recipe[key] is None]:
+        raise InputError(f"scatter.model: body takes {' and '.join(missing)}, such as Tc-99m and 0.1")
+    return BodyScatter(recipe["scatter.precision"], recipe["scatter.seed"])
 
 
 def _volume_name(record: Recipe) -> str:

@@ -228,6 +228,15 @@ _DECLARED = (
             "radiographs", words={"auto": ("Automatic", "")}, least=1, slider=100, needs=(_RAYS,)),
     Setting("model.tolerance", float, 0.02, "Largest error of a single voxel's total in any module, as a share of it",
             above=0, slider=1, needs=(_RAYS,)),
+    Setting("scatter.model", str, "none", "Photons that the body scatters before a hole sees them", label="Scatter", words={
+        "none": ("None", "They are left out"),
+        "body": ("In the Body", "Simulated in the attenuation by Monte Carlo; takes an isotope and an energy resolution"),
+    }, needs=(_COUNTS, _MADE), option="--scatter"),
+    Setting("scatter.precision", float, 0.005, "Standard deviation of each module's total of scattered photons, as a share "
+            "of it; half of it takes four times as long", above=0, most=0.5, slider=0.05, needs=("scatter.model=body",),
+            option="--scatter-precision", label="Precision"),
+    Setting("scatter.seed", int, 0, "Seed of the simulation of scatter; of several states or frames SEED, SEED + 1 …",
+            least=0, most=2**31 - 1, needs=("scatter.model=body",), option="--scatter-seed", label="Scatter Seed"),
     Setting("detector.plane", str, "virtual", "Plane of the images", label="Detector", option="--detector", words={
         "virtual": ("Virtual", "Plane in front of the pinhole: upright, as the module's camera sees it"),
         "real": ("Real", "Front face of the crystal behind the pinhole: point-inverted"),

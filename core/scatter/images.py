@@ -3,6 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from time import perf_counter
 from typing import Any
 
 import numpy as np
@@ -13,11 +14,12 @@ from ..geometry.grid import Grid
 from ..geometry.views import Views
 from ..memory import require
 from ..models.emission import Emission
+from ..models.photon_lines import mu_volumes
 from ..physics.energy_window import acceptance
 from ..physics.isotopes import Window
 from ..physics.mass_attenuation import HIGHEST_ENERGY
 from ..physics.materials import APERTURES, CRYSTALS, attenuation, module_coefficients
-from ..progress import Progress, part_of
+from ..progress import Progress, part_of, stages_of
 from ..projector.operator import Projector
 from ..rays.parallel import in_order, thread_count
 from ..rays.ray_geometry import view_rays
@@ -109,7 +111,8 @@ def scatter_images(
     threads : int, optional
         Number of threads, by default one per core.
     progress : callable, optional
-        Called as ``progress(done, total)``; may raise `Cancelled`.
+        Called as ``progress(done, total)``, for a trial and again for the histories; may raise `Cancelled`. A
+        `StagedProgress` is told their number and the seconds that they take.
 
     Returns
     -------
@@ -150,6 +153,26 @@ def scatter_images(
     return run.result()
 
 
+def scattering_body(model: Emission) -> Volume:
+    """Return a model's attenuation as the body of `scatter_images`; raise `InputError` if the model has none."""
+    instance(model, Emission, "scatter: model")
+    volumes: Sequence[Volume] = mu_volumes(model.mu)  # type: ignore[arg-type]  # in a model a tuple, not any sequence
+    if not volumes:
+        raise InputError(
+            "scatter: the model has no attenuation, in which photons scatter: give mu (--mu FILE, --phantom-mu)"
+        )
+    energies = [energy for energy, _ in model.photon_lines]
+    return volumes[0] if len(volumes) == 1 else volumes[energies.index(_strongest_line(model))]
+
+
+def _strongest_line(model: Emission) -> float:
+    """Return the energy, keV, of the strongest line in the window of a model with an isotope."""
+    isotope: Any = model.isotope
+    window: Any = model.window
+    energy, _ = max(isotope.lines_within(*window), key=lambda line: line[1])
+    return float(energy)
+
+
 def _checked_window(window: Any) -> Window:
     """Return a window as two numbers; raise `InputError` unless they are ascending energies."""
     low, high = real_array(window, "scatter: window", (2,)).tolist()
@@ -176,7 +199,7 @@ class _Run:
         self._views, self._model, self._windows, self._threads = views, model, windows, threads
         isotope: Any = model.isotope
         lines = [line for line in (*isotope.lines, *isotope.weak_lines) if line[0] > LOWEST_ENERGY]
-        self._reference, _ = max(isotope.lines_within(*model.window), key=lambda line: line[1])  # type: ignore[misc]
+        self._reference = _strongest_line(model)
         self._body, self._source = Body.of(body, self._reference), Source.of(activity, lines)
         self._energies = self._table_energies(max(energy for energy, _ in lines), spectra)
         cell_of, self._cells = _cells(self._body.grid)
@@ -198,13 +221,16 @@ class _Run:
 
     def follow_until(self, precision: float, progress: Progress | None) -> None:
         """Follow histories until all modules' totals in the first window are known to a relative `precision`."""
-        self._follow_rounds(_PILOT, part_of(progress, 0, 20))
+        stages, start = stages_of(progress), perf_counter()
+        self._follow_rounds(_PILOT, stages("trying scatter"))
+        seconds = (perf_counter() - start) / self._histories.followed
         self._histories.seen[:] = 0
         self._modules["least"] = np.max(np.mean(self._rounds, axis=0), axis=0)
         needed = self._needed(_PILOT, precision)
         self._rounds, self._counts = [], []
         for _ in range(3):  # the trial's deviations are not exact
-            self.follow(needed, progress and (lambda done, total: progress(total + 19 * done, 20 * total)))
+            count = needed * _PARTS * _ROUNDS
+            self.follow(needed, stages(f"scattering {count} photons, some {max(count * seconds, 1):.0f} s"))
             so_far = self._count // (_PARTS * _ROUNDS)
             more = self._needed(so_far, precision) - so_far
             if more * 8 < needed:

@@ -284,7 +284,7 @@ def recipe_scatter(recipe: Recipe) -> BodyScatter | None:
     if recipe["scatter.model"] == "none":
         return None
     if missing := [key for key in ("model.isotope", "model.energy_fwhm") if recipe[key] is None]:
-        raise InputError(f"scatter.model: body takes {' and '.join(missing)}, such as Tc-99m and 0.1")
+        raise InputError(f"scatter.model: body needs {' and '.join(missing)}: photons are counted by their energy")
     return BodyScatter(recipe["scatter.precision"], recipe["scatter.seed"])
 
 

@@ -293,3 +293,26 @@ def test_a_volume_that_is_not_in_the_panel_is_found_again(render, scene):
     assert not runs.has_scene_changed(scene)
     assert bpy.ops.mphdrr.render_projections() == {"FINISHED"}
     assert runs.changes(scene) == [] and rendering.run_file_path(scene.mphdrr_projections.run_file)
+
+
+def test_a_run_with_scatter_shows_its_photons_apart(render, scene):
+    water = Volume(np.full((10, 10, 10), 0.0153, np.float32), Grid.centered(10, 10.0), "mu")
+    body = volumes.add_volume(water, "Body")
+    set_(volume=phantom(), mu=body, isotope="Tc-99m", scatter="BODY", scatter_precision=0.1)
+    with pytest.raises(RuntimeError, match=r"body needs Energy FWHM"):
+        bpy.ops.mphdrr.render_projections()
+    set_(energy_fwhm=0.1)
+    run = read_run(storage.absolute(render().file))
+    third = run.system.numbers.tolist().index(3)
+    np.testing.assert_allclose(shown_array(), run.projections[third], rtol=1e-6)
+    assert [(part, is_shown) for part, _, is_shown in runs.parts_to_show(scene)] == [
+        ("ALL", True), ("PRIMARY", False), ("SCATTER", False),
+    ]  # fmt: skip
+    for part, expected in (("SCATTER", run.scatter), ("PRIMARY", run.projections - run.scatter), ("ALL", run.projections)):
+        bpy.ops.mphdrr.show_run(index=0, photons=part)
+        np.testing.assert_allclose(shown_array(), expected[third], rtol=1e-6)
+        assert [name for name, _, is_shown in runs.parts_to_show(scene) if is_shown] == [part]
+    set_(scatter="NONE")
+    assert [line for line in runs.changes(scene) if "catter" in line]
+    render()
+    assert runs.parts_to_show(scene) == []

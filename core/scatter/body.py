@@ -38,7 +38,7 @@ class Body:
         density, above it a mixture of water and cortical bone. Voxels around the body that hold nothing are left out.
         """
         require_quantity(volume.quantity, ("hu", "mu"), "scatter: body")
-        water, bone = (attenuation(each.material, energy) for each in SCATTERERS)
+        water, bone = (attenuation(scatterer.material, energy) for scatterer in SCATTERERS)
         mu = (volume if volume.quantity == "mu" else hu_to_mu(volume, energy)).array.astype(np.float64)
         if mu.size and mu.min() < 0:
             raise InputError(f"scatter: body: expected attenuation coefficients of 0 or more, got {mu.min():g}")
@@ -86,7 +86,7 @@ def momentum_tables() -> MomentumTables:
     """Return the functions up to the largest momentum transfer of all energies."""
     roots = np.linspace(0, np.sqrt(HIGHEST_ENERGY / WAVELENGTH_ENERGY), _MOMENTA)
     incoherent, coherent = (
-        np.array([f(each, roots**2) for each in SCATTERERS])
+        np.array([f(scatterer, roots**2) for scatterer in SCATTERERS])
         for f in (Scatterer.incoherent_function, Scatterer.coherent_function)
     )
     steps = (coherent[:, 1:] + coherent[:, :-1]) / 2 * np.diff(roots**4)

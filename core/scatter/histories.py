@@ -20,7 +20,7 @@ _HISTORIES_AT_ONCE = 2048  # of a piece of work: its collisions are some MB
 
 
 @dataclass(frozen=True, eq=False)
-class Source:
+class PhotonSource:
     """Photons that begin in the voxels of a volume of activity, to all sides."""
 
     grid: Grid
@@ -34,7 +34,7 @@ class Source:
     """Energies, keV, and shares of the photons up to each line (2, n)."""
 
     @classmethod
-    def of(cls, activity: Volume, lines: Sequence[tuple[float, float]]) -> "Source":
+    def of(cls, activity: Volume, lines: Sequence[tuple[float, float]]) -> "PhotonSource":
         """Return the source of a volume of activity, kBq/mL, and photon lines: energies, keV, and photons per decay."""
         values = activity.array.astype(np.float64)
         if values.min(initial=0.0) < 0:
@@ -44,11 +44,11 @@ class Source:
         interleaved = ((voxels[:, None, :] >> bits[:, None] & 1) << (3 * bits[:, None] + [2, 1, 0])).sum(axis=(1, 2))
         voxels = voxels[np.argsort(interleaved)]  # G. M. Morton's order
         until = np.cumsum(values[tuple(voxels.T)])
-        whole = float(until[-1]) if len(until) else 0.0
+        activity_sum = float(until[-1]) if len(until) else 0.0
         energies, photons = np.array(lines, np.float64).T
-        total = whole * activity.grid.voxel_volume * photons.sum()
+        total = activity_sum * activity.grid.voxel_volume * photons.sum()
         shares = np.cumsum(photons) / photons.sum()
-        return cls(activity.grid, voxels, until / (whole or 1.0), float(total), np.array([energies, shares]))
+        return cls(activity.grid, voxels, until / (activity_sum or 1.0), float(total), np.array([energies, shares]))
 
     def starts(self, first: int, end: int, seed: int, all_first: int) -> Array:
         """Return the photons from number `first` to `end` of those from `all_first` on, as `rays.backends.cpu.START`.
@@ -102,7 +102,7 @@ class Histories:
     def __init__(
         self,
         body: Body,
-        source: Source,
+        source: PhotonSource,
         modules: Array,
         energies: Floats,
         accepted: Floats32,
@@ -140,28 +140,28 @@ class Histories:
         }  # fmt: skip
 
     def run(self, count: int, progress: Progress | None = None) -> None:
-        """Follow so many further histories, and add what the modules see of them to `seen`."""
+        """Compute so many further histories, and add what the modules see of their collisions to `seen`."""
         first, end = self.followed, self.followed + count
         pieces = [(a, min(a + _HISTORIES_AT_ONCE, end)) for a in range(first, end, _HISTORIES_AT_ONCE)]
         modules = self._settings["modules"]
         size = -(-modules // self._threads)
         parts = [(a, min(a + size, modules)) for a in range(0, modules, size)]
-        found = in_order(lambda piece: self._follow(*piece, first), pieces, self._threads)
-        for done, collisions in enumerate(found, 1):
+        jobs = in_order(lambda piece: self._follow(*piece, first), pieces, self._threads)
+        for n_done, collisions in enumerate(jobs, 1):
             for job in collisions:
                 run_all(lambda part, job=job: self._see(job, *part), parts, self._threads)  # type: ignore[misc]
-            tell(progress, done, len(pieces))
+            tell(progress, n_done, len(pieces))
         self.followed = end
 
     def collisions(self, count: int) -> Array:
         """Return the collisions of so many further histories, of the type `rays.backends.cpu.COLLISION`."""
         first, self.followed = self.followed, self.followed + count
-        found = self._follow(first, self.followed, first)
-        return np.concatenate([arrays[0][: arrays[1][1]] for _, arrays in found])
+        jobs = self._follow(first, self.followed, first)
+        return np.concatenate([arrays[0][: arrays[1][1]] for _, arrays in jobs])
 
     def _follow(self, first: int, end: int, all_first: int) -> list[tuple[Any, tuple[Array, ...]]]:
         """Return the collisions of the histories from `first` to `end`, as jobs for `_see` with their arrays."""
-        found: list[tuple[Any, tuple[Array, ...]]] = []
+        jobs: list[tuple[Any, tuple[Array, ...]]] = []
         starts = self._source.starts(first, end, self._settings["seed"], all_first)
         end = first + len(starts)  # none where nothing is active
         begins = first
@@ -175,12 +175,12 @@ class Histories:
             )  # fmt: skip
             self._kernels.library.follow(self._kernels.level, ctypes.byref(job))
             first = int(numbers[0])
-            found.append((job, (collisions, numbers, starts)))
-        return found
+            jobs.append((job, (collisions, numbers, starts)))
+        return jobs
 
-    def _see(self, found: tuple[Any, Any], first: int, end: int) -> None:
+    def _see(self, job_with_arrays: tuple[Any, Any], first: int, end: int) -> None:
         """Add what the modules from `first` to `end` see of the collisions."""
-        job = self._kernels.PhotonJob.from_buffer_copy(found[0])
+        job = self._kernels.PhotonJob.from_buffer_copy(job_with_arrays[0])
         job.first_module, job.last_module = first, end
         self._kernels.library.see(self._kernels.level, ctypes.byref(job))
 

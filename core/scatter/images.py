@@ -27,7 +27,7 @@ from ..recording import recorded_warnings
 from ..validation import freeze, instance, positive, real_array, seed_number, strict_whole
 from ..volumes.volume import Volume, require_quantity
 from .body import LOWEST_ENERGY, Body
-from .histories import Histories, Source
+from .histories import Histories, PhotonSource
 
 _ENERGIES = 512  # of the tables
 _LEAST_SHARE = 1e-4  # of the photons of an energy that a window counts: below it they are not followed
@@ -73,7 +73,7 @@ def scatter_images(
     threads: int | None = None,
     progress: Progress | None = None,
 ) -> ScatterImages:
-    """Simulate the images of photons that are scattered in a body before they pass a module's hole.
+    """Compute the images of photons that are scattered in a body before they pass a module's hole.
 
     Photons of all lines of the model's isotope begin where the activity is, and are followed through the voxels of the body:
     Compton scattering by Klein and Nishina's law and the incoherent scattering function, Rayleigh scattering by form
@@ -200,7 +200,7 @@ class _Run:
         isotope: Any = model.isotope
         lines = [line for line in (*isotope.lines, *isotope.weak_lines) if line[0] > LOWEST_ENERGY]
         self._reference = _strongest_line(model)
-        self._body, self._source = Body.of(body, self._reference), Source.of(activity, lines)
+        self._body, self._source = Body.of(body, self._reference), PhotonSource.of(activity, lines)
         self._energies = self._table_energies(max(energy for energy, _ in lines), spectra)
         cell_of, self._cells = _cells(self._body.grid)
         self._modules = _modules(views, model, float(np.linalg.norm(self._cells.spacing)))
@@ -220,7 +220,7 @@ class _Run:
         self._projectors = [self._projector(m) for m in range(len(views))]
 
     def follow_until(self, precision: float, progress: Progress | None) -> None:
-        """Follow histories until all modules' totals in the first window are known to a relative `precision`."""
+        """Run histories until all modules' totals in the first window are known to a relative `precision`."""
         stages, start = stages_of(progress), perf_counter()
         self._follow_rounds(_PILOT, stages("trying scatter"))
         seconds = (perf_counter() - start) / self._histories.followed
@@ -232,10 +232,10 @@ class _Run:
             count = needed * _PARTS * _ROUNDS
             self.follow(needed, stages(f"scattering {count} photons, some {max(count * seconds, 1):.0f} s"))
             so_far = self._count // (_PARTS * _ROUNDS)
-            more = self._needed(so_far, precision) - so_far
-            if more * 8 < needed:
+            missing = self._needed(so_far, precision) - so_far
+            if missing * 8 < needed:
                 return
-            needed = more
+            needed = missing
 
     def _needed(self, count: int, precision: float) -> int:
         """Return the number of histories of each of 16 rounds that a precision takes, by those of `count` so far."""
@@ -251,7 +251,7 @@ class _Run:
         return np.divide(error, mean, out=np.zeros_like(mean), where=mean > 0)
 
     def follow(self, count: int, progress: Progress | None) -> None:
-        """Follow `count` histories in each round of some parts, and add these to the mean image and its variance.
+        """Run `count` histories in each round of some parts, and add these to the mean image and its variance.
 
         By D. H. D. West, Communications of the ACM 22 (1979) 532, with the histories of a part as its weight.
         """
@@ -265,23 +265,23 @@ class _Run:
             self._squares += off.sum(axis=0) ** 2 * (new * (1 - new / self._count))
 
     def _follow_rounds(self, count: int, progress: Progress | None, rounds: int = _PARTS * _ROUNDS) -> None:
-        """Follow rounds of `count` histories, and keep their totals."""
-        before = 0.0
+        """Run rounds of `count` histories, and keep their totals."""
+        last_total = 0.0
         for k in range(rounds):
             self._histories.run(count, part_of(progress, k, rounds))
             total = np.einsum("owcm,cm->wm", self._histories.seen, self._sensitivity)
-            self._rounds.append((total - before) / count)
+            self._rounds.append((total - last_total) / count)
             self._counts.append(count)
-            before = total
+            last_total = total
 
-    def _project(self, seen: Array) -> Array:
+    def _project(self, weights: Array) -> Array:
         """Return the images (orders, W, M, n_v, n_u) of what the modules saw, for one history."""
         scale = self._source.photons / self._cells.voxel_volume
         images = np.empty(self._mean.shape, np.float32)
 
         def project(m: int) -> None:
             for order, window in np.ndindex(images.shape[:2]):
-                emission = seen[order, window, :, m].reshape(self._cells.shape) * scale
+                emission = weights[order, window, :, m].reshape(self._cells.shape) * scale
                 images[order, window, m] = self._projectors[m](emission)[0] if emission.any() else 0
 
         for _ in in_order(project, range(len(self._views)), self._threads):
@@ -313,9 +313,9 @@ class _Run:
             aperture_mu=optics.aperture_mu, crystal_mu=optics.crystal_mu, wall_thickness=None, background=0.0,
             time=model.effective_time, start=0.0,
         )  # fmt: skip
-        one = np.array([m])
+        module = np.array([m])
         with recorded_warnings():  # they are those of the model's own projector
-            return Projector(self._cells, self._views[one], plain.of_views(one), threads=1)
+            return Projector(self._cells, self._views[module], plain.of_views(module), threads=1)
 
     def _table_energies(self, highest: float, spectra: bool) -> Floats:
         """Return the energies, keV, of the tables: from the lowest that a window counts to the highest of the lines."""
@@ -352,8 +352,10 @@ def _optics_ratio(model: Emission, energies: Floats) -> Floats:
         for name in APERTURES:
             if module_coefficients(name, None, lines, system, optics.opening_angle)[0] == optics.aperture_mu:
                 for i, energy in enumerate(energies):
-                    there = optics.with_numbers({"aperture_mu": attenuation(name, energy)})
-                    ratio[:, i] *= (there.effective_diameter(diameters) / optics.effective_diameter(diameters)) ** 2
+                    optics_there = optics.with_numbers({"aperture_mu": attenuation(name, energy)})
+                    ratio[:, i] *= (
+                        optics_there.effective_diameter(diameters) / optics.effective_diameter(diameters)
+                    ) ** 2
     if optics.crystal_mu is not None:
         usual = np.broadcast_to(optics.crystal_mu, len(system))
         for m in range(len(system)):
@@ -366,8 +368,8 @@ def _optics_ratio(model: Emission, energies: Floats) -> Floats:
 def _crystal_of(model: Emission, mu: float) -> str:
     """Return the crystal that has this coefficient at the model's lines; "" if none has."""
     arguments = model.photon_lines, model.system, model.optics.opening_angle
-    found = (name for name in CRYSTALS if module_coefficients(None, name, *arguments)[1] == mu)
-    return next(found, "")
+    names = (name for name in CRYSTALS if module_coefficients(None, name, *arguments)[1] == mu)
+    return next(names, "")
 
 
 def _cells(grid: Grid) -> tuple[Array, Grid]:
@@ -414,10 +416,10 @@ def _sensitivity(modules: Array, cells: Grid) -> Floats32:
         to = places - module["hole"]
         height = to @ module["axis"]
         slopes = (to @ module[side] / np.where(height > 0, height, np.inf) for side in "uv")
-        seen = height > 0
+        is_seen = height > 0
         for slope, low, high in zip(slopes, module["slopes"][::2], module["slopes"][1::2], strict=True):
-            seen &= (slope > low) & (slope < high)
-        result[:, m] = np.where(seen, module["area"] * height / np.maximum(np.linalg.norm(to, axis=1), 1e-9) ** 3, 0)
+            is_seen &= (slope > low) & (slope < high)
+        result[:, m] = np.where(is_seen, module["area"] * height / np.maximum(np.linalg.norm(to, axis=1), 1e-9) ** 3, 0)
     return result
 
 

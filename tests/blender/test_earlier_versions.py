@@ -106,7 +106,7 @@ DEFAULTS = {
     "detector": "VIRTUAL", "backend": "AUTO", "rows": "BY_NUMBER", "unit": "NONE",
     "colors": "INFERNO", "scale": "LINEAR", "region": "OBJECT", "planes": "ALL", "look": "DENSITY", "figure": "SCANNER",
     "method": "OSEM", "prior": "NONE", "hole": "AUTO", "lines": "TOGETHER", "dead_time_kind": "NON_PARALYSABLE",
-    "panel": "COUNTING", "sensor": "NONE", "materials": "WATER_BONE",
+    "panel": "COUNTING", "sensor": "NONE", "scatter": "NONE", "materials": "WATER_BONE",
     "how": "SUM", "uniform": "K", "MixturePhantomProperties.look": "solids",
 }  # fmt: skip
 """What files mean that do not hold a choice, because nobody has made it."""

@@ -472,7 +472,9 @@ def test_a_recipe_that_the_panel_cannot_take_is_one_clear_line(scene, tmp_path, 
 
 def test_every_setting_has_a_property_of_its_own():
     shown = [
-        key for key in SETTINGS if key.startswith(("system.modules", "model.", "detector.", "frames.", "compute."))
+        key
+        for key in SETTINGS
+        if key.startswith(("system.modules", "model.", "scatter.", "detector.", "frames.", "compute."))
     ]
     elsewhere = 2  # the opening angle is the scanner's, bins are of files
     assert len({setting.key for setting in PROPERTIES.values()}) == len(shown) - elsewhere

@@ -308,7 +308,11 @@ def test_a_run_with_scatter_shows_its_photons_apart(render, scene):
     assert [(part, is_shown) for part, _, is_shown in runs.parts_to_show(scene)] == [
         ("ALL", True), ("PRIMARY", False), ("SCATTER", False),
     ]  # fmt: skip
-    for part, expected in (("SCATTER", run.scatter), ("PRIMARY", run.projections - run.scatter), ("ALL", run.projections)):
+    for part, expected in (
+        ("SCATTER", run.scatter),
+        ("PRIMARY", run.projections - run.scatter),
+        ("ALL", run.projections),
+    ):
         bpy.ops.mphdrr.show_run(index=0, photons=part)
         np.testing.assert_allclose(shown_array(), expected[third], rtol=1e-6)
         assert [name for name, _, is_shown in runs.parts_to_show(scene) if is_shown] == [part]

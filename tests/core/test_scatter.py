@@ -10,7 +10,7 @@ import mphdrr.core as mph
 from mphdrr.core.physics.photon_scattering import Scatterer, compton_ratio
 from mphdrr.core.rays.backends.cpu import MODULE
 from mphdrr.core.scatter.body import Body
-from mphdrr.core.scatter.histories import Histories, Source
+from mphdrr.core.scatter.histories import Histories, PhotonSource
 
 from . import photon_flights as flights
 from .conftest import refused
@@ -47,7 +47,7 @@ def histories(body, activity, energy=KEV, seed=0):
     energies = np.linspace(30.0, energy, 512)
     places = np.zeros(body.grid.shape, np.int32)
     return Histories(
-        body, Source.of(activity, [(energy, 1.0)]), np.zeros(0, MODULE), energies, np.zeros((0, 1, 512), np.float32),
+        body, PhotonSource.of(activity, [(energy, 1.0)]), np.zeros(0, MODULE), energies, np.zeros((0, 1, 512), np.float32),
         places, 1, 1, seed, 1, False,
     )  # fmt: skip
 

@@ -8,7 +8,7 @@
 #include <stdlib.h>
 #include <string.h>
 
-enum { RAYS, TAKE, GIVE };
+enum { RAYS, TAKE, GIVE, PHOTONS };
 
 // Of a bundle of rays. With it come voxels of the volume, voxels of mu if there is mu, the fans or the list's columns, and
 // values.
@@ -109,6 +109,28 @@ static void run_places(int64_t level, void (*kernel)(int64_t, const PlacesJob *)
     if (job.exponents) fwrite(job.exponents, 4, points, results);
 }
 
+// With a PhotonJob come body, tables, photons, modules, shares and cells. Writes the number of collisions, and what is seen.
+static void run_photons(int64_t level) {
+    PhotonJob job;
+    if (!fread(&job, sizeof job, 1, jobs)) abort();
+    const size_t voxels = job.n[0] * job.n[1] * job.n[2], tables = MATERIALS * job.energies, momenta = MATERIALS * job.momenta;
+    const size_t seen = job.orders * job.windows * job.cells * job.modules, end = job.last;
+    job.body = taken(voxels * MATERIALS * 4), job.coefficients = taken(3 * tables * 4);
+    job.incoherent = taken(momenta * 4), job.coherent = taken(momenta * 4), job.coherent_until = taken(momenta * 4);
+    job.starts = taken((end - job.all_first) * sizeof(Start)), job.holes = taken(job.modules * sizeof(Module));
+    job.accepted = taken(job.modules * job.windows * job.energies * 4), job.cell_of = taken(voxels * 4);
+    job.collisions = block(job.capacity * sizeof(Collision)), job.seen = block(seen * 4);
+    job.followed = block(8), job.n_collisions = block(8);
+    if (job.spectra) job.spectra = block(job.modules * job.energies * 8);
+    int64_t collisions = 0;
+    for (job.first = job.all_first; job.first < (int64_t)end; job.first = *job.followed) {
+        follow(level, &job), see(level, &job);
+        collisions += *job.n_collisions;
+    }
+    fwrite(&collisions, 8, 1, results);
+    fwrite(job.seen, 4, seen, results);
+}
+
 static int all(void) {
     int64_t kind_and_level[2];
     jobs = fopen("jobs", "rb"), results = fopen("results", "wb");
@@ -118,7 +140,8 @@ static int all(void) {
         switch (kind_and_level[0]) {
         case RAYS: run_rays(level); break;
         case TAKE: run_places(level, take_at); break;
-        default: run_places(level, give_at);
+        case GIVE: run_places(level, give_at); break;
+        default: run_photons(level);
         }
         give_back();
     }

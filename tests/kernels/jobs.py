@@ -11,7 +11,7 @@ import numpy as np
 Array = np.ndarray[Any, Any]
 Read = Callable[[Any, tuple[int, ...]], Array]  # the next result, of a kind of number and a shape
 
-KINDS = ("rays", "take", "give")  # as check.c numbers them
+KINDS = ("rays", "take", "give", "photons")  # as check.c numbers them
 BAD = (np.nan, np.inf, -np.inf, 1e300, -1e300, 5e-324, -1e-310, 0.0, -0.0, 1e30, 2.0**31, -(2.0**63))
 
 

@@ -24,6 +24,7 @@ from mphdrr.core.rays.backends.cpu import _fans
 from mphdrr.core.rays.ray_geometry import Attenuation, IndexFans, IndexRays
 
 from .jobs import BAD, Made, Read, close, packed
+from .photon_jobs import photon_jobs
 from .places_jobs import places_jobs
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -206,7 +207,7 @@ def rays_jobs() -> Iterator[Made]:
 
 @pytest.fixture(scope="module")
 def jobs() -> dict[str, list[Made]]:
-    return {"rays": list(rays_jobs()), "places": list(places_jobs())}
+    return {"rays": list(rays_jobs()), "places": list(places_jobs()), "photons": list(photon_jobs())}
 
 
 def compare(jobs: dict[str, list[Made]], command: list[str | Path], folder: Path, **options: Any) -> None:
@@ -251,7 +252,7 @@ def link_with_gcc(flags: tuple[str, ...], objects: list[str], folder: Path) -> N
     target = build_kernels.PLATFORMS["linux-x64"].target
     build_kernels.zig("cc", "-target", target, *flags, "-c", DRIVER, "-o", "check.o", cwd=folder)
     sanitizers = [flag for flag in flags if flag.startswith("-fsanitize")]
-    command = ("gcc", *sanitizers, "check.o", *objects, "-Wl,-rpath,$ORIGIN", "-o", "check.exe")
+    command = ("gcc", *sanitizers, "check.o", *objects, "-lm", "-Wl,-rpath,$ORIGIN", "-o", "check.exe")
     subprocess.run(command, cwd=folder, check=True)
 
 

@@ -19,10 +19,13 @@ _ENERGIES = np.linspace(30.0, 150.0, 16)
 
 
 def photon_jobs() -> Iterator[Made]:
-    """Yield jobs whose sums are compared with those of the kernels that Python calls."""
-    rng = np.random.default_rng(22)
+    """Yield jobs, of which nearly all must give the sums of the kernels that Python calls.
+
+    Rounding sends a photon that just meets something elsewhere, now and then.
+    """
+    rng, alike = np.random.default_rng(22), []
     for number in range(JOBS):
-        yield _job(rng, number)
+        yield _job(rng, number, alike)
 
 
 def _starts(rng: np.random.Generator, size: Array) -> Array:
@@ -51,7 +54,7 @@ def _modules(rng: np.random.Generator, size: Array) -> Array:
     return modules
 
 
-def _job(rng: np.random.Generator, number: int) -> Made:
+def _job(rng: np.random.Generator, number: int, alike: list[bool]) -> Made:
     shape = tuple(int(n) for n in rng.integers(1, rng.choice([2, 4, 9]), 3, endpoint=True))
     grid = Grid.centered(shape, float(rng.choice([0.1, 5.0, 80.0])))
     mu = rng.choice([0.0, 0.005, 0.0153, 0.03], shape) * (rng.random(shape) < 0.8)
@@ -85,9 +88,12 @@ def _job(rng: np.random.Generator, number: int) -> Made:
         counted = int(read(np.int64, (1,))[0])
         seen = read(np.float32, histories.seen.shape)
         assert np.isfinite(seen).all() and (seen >= 0).all()
-        # Rounding sends a photon that just meets something elsewhere, now and then.
         assert abs(counted - collisions) <= 8 + 0.1 * collisions
-        assert abs(seen.sum(dtype=float) - total) <= 0.3 * total or abs(counted - collisions) > 0, (seen.sum(), total)
+        alike.append(counted == collisions and abs(seen.sum(dtype=float) - total) <= 1e-3 * total)
+        if number == JOBS - 1:
+            share = np.mean(alike)
+            alike.clear()
+            assert share > 0.8
 
     return Made(data, check)
 

@@ -1,7 +1,7 @@
 """What scattered photons of a thorax cost, beside the exact projector: ``python benchmarks/scatter.py [PRECISION]``.
 
 All 80 modules, 64^2 pixels, a torso of 64^3 voxels of 6 mm, Tc-99m. Each line is a process of its own, whose peak of
-memory is told above what it had before. Patches are of 10 mm on the virtual detector where the torso's axis is.
+memory is told above what it had before. Patches are pixels that together cover 10 mm at the isocentre.
 """
 
 from __future__ import annotations

@@ -41,7 +41,9 @@ class PhotonSource:
             raise InputError(f"scatter: activity: expected 0 or more, got {values.min():g}")
         voxels = np.argwhere(values)
         bits = np.arange(20)
-        interleaved = ((voxels[:, None, :] >> bits[:, None] & 1) << (3 * bits[:, None] + np.array([2, 1, 0]))).sum(axis=(1, 2))
+        interleaved = ((voxels[:, None, :] >> bits[:, None] & 1) << (3 * bits[:, None] + np.array([2, 1, 0]))).sum(
+            axis=(1, 2)
+        )
         voxels = voxels[np.argsort(interleaved)]  # G. M. Morton's order
         until = np.cumsum(values[tuple(voxels.T)])
         activity_sum = float(until[-1]) if len(until) else 0.0

@@ -48,6 +48,7 @@ def cylinder(radius=110.0, half_length=83.2, voxel=4.0, fine=8):
     return mph.Volume(np.float32(MU * along[:, None, None] * disc), mph.Grid.centered(shape, voxel), "mu")
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("crystal, tolerance", [(None, 0.01), ("NaI", 0.02)])
 def test_the_scatter_fraction_of_simind_s_test_case(crystal, tolerance):
     """A point in a cylinder of water of 220 mm, 140 keV, 126 to 154 keV, 8.8 %: SIMIND's fraction has an SD of 0.2 %."""
@@ -59,6 +60,7 @@ def test_the_scatter_fraction_of_simind_s_test_case(crystal, tolerance):
     assert scatter / (scatter + primary) == pytest.approx(0.39337, rel=tolerance)
 
 
+@pytest.mark.long
 def test_spectra_of_photons_that_leave_a_slab_are_those_of_goupil():
     cosine = np.array([0.965, 0.975, 0.985, 0.995] * 2) * np.repeat([1, -1], 4)
     sine, turn = np.sqrt(1 - cosine**2), 1.1 * np.arange(8)

@@ -43,6 +43,7 @@ def bsrem(
     step_decay: float = 0.0,
     background: ArrayLike = 0.0,
     *options: Any,
+    scatter: str = "none",
     **named: Unpack[IterativeOptions],
 ) -> Reconstruction:
     """Reconstruct the activity that maximises ``log-likelihood - prior`` (BSREM); converges to the maximum, unlike OSEM.
@@ -96,7 +97,7 @@ def bsrem(
     image reconstruction", IEEE Transactions on Medical Imaging 42 (2023) 29-41.
     """
     step_decay = at_least_0(step_decay, "step_decay")
-    loop = CountLoop("BSREM", A, counts, iterations, subsets, prior, background, *options, **named)
+    loop = CountLoop("BSREM", A, counts, iterations, subsets, prior, background, *options, scatter=scatter, **named)
     n, penalty, sensitivity = len(loop.subsets), loop.penalty, loop.sensitivity
     require(8 * n * A.grid.n_voxels, f"the gradients of {n} subsets")
     # At the maximum the expected counts of a single voxel do not exceed the measured counts.

@@ -1,6 +1,6 @@
 """Measured counts with an additive background: Poisson log-likelihood, checks, and the iteration loop of count methods."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -10,16 +10,19 @@ from ..errors import InputError, warn
 from ..geometry.frames import affine_matrix
 from ..geometry.grid import Grid
 from ..memory import require
-from ..progress import Progress
+from ..progress import Progress, part_of
 from ..projector import Projector
 from ..validation import instance, real_array, shape_text
-from .loop import Loop, numpy_if_tensor
+from .body_scatter import estimate_scatter, scatter_body
+from .loop import Loop, Step, numpy_if_tensor
 from .priors import Prior, make_penalty
+from .result import Reconstruction
 
 NEGLIGIBLE = np.float32(1e-30)
 """Divisor at or below which a quotient is left out, because float32 could not hold it."""
 
 _UNSEEN = 1e-3  # share of the brightest pixel's counts up to which a pixel sees nothing
+_SETTLED = 0.01  # change of the modules' scatter, as a share of it, below which its estimate is final
 _CERTAIN_GAIN, _CERTAIN_SHARE = 30.0, 0.015
 """Gain of log-likelihood that chance cannot explain, and the share of the counts that a coarse model cannot explain."""
 
@@ -96,6 +99,9 @@ class CountLoop(Loop):
         See `mlem`.
     subsets : int, optional
         Number of subsets; by default about a fifth of the number of views.
+    scatter : str
+        Scatter that is estimated, see `mlem`. The estimate is made after iterations 1, 2, 4, 8 and so on, until it changes by
+        less than 1 %: early volumes, which change fast, soon have another one, and late ones are hardly simulated again.
     options, named
         See `IterativeOptions`.
 
@@ -127,12 +133,21 @@ class CountLoop(Loop):
         prior: Prior | None,
         background: ArrayLike,
         *options: Any,
+        scatter: str = "none",
         **named: Any,
     ) -> None:
         super().__init__(method, A, iterations, *options, **named)
-        self.data = CountData.checked(method, A, counts, background)
+        self.data = self._given = CountData.checked(method, A, counts, background)
+        self._body = scatter_body(scatter, A)
+        if self._resumed and (was := self._resumed.get("scatter", "none")) != scatter:
+            advice = "give its volume (--start) to begin with that"
+            raise InputError(f"start: this reconstruction is with scatter {was}, now {scatter}: {advice}")
         projectors = A.subsets(max(1, len(A.views) // 5) if subsets is None else subsets)
         self.subsets = [(projector, self.data[projector.which]) for projector in projectors]
+        if self._body is not None:
+            if 3 in (np.ndim(numpy_if_tensor(background)), np.ndim(A.model.background)):
+                warn("scatter: the background holds images, too: leave it out if these are scatter", 3)
+            self._add_scatter()
         require(4 * A.grid.n_voxels * len(projectors), f"the sensitivities of {len(projectors)} subsets")
         ones = ((projector, np.ones(projector.shape_out, np.float32)) for projector in projectors)
         self.sensitivities = [np.asarray(projector.T(image, self.preparing()), np.float32) for projector, image in ones]
@@ -166,15 +181,59 @@ class CountLoop(Loop):
 
     def objective(self, values: Array, progress: Progress | None) -> float:
         """Return the log-likelihood of a volume minus the prior's penalty."""
-        images: Array = self._A(values, progress)
+        self._images = self._A(values, progress)
+        return self._objective_of(values, self._images)
+
+    def _objective_of(self, values: Array, images: Array) -> float:
+        """Return the objective of a volume with these images, and keep it as `last_objective`."""
         likelihood = self.data.log_likelihood(images)
-        self._images = images
         self.last_objective = likelihood if self.penalty is None else likelihood - self.penalty.value(values)
         return self.last_objective
 
+    def run(self, step: Step, **settings: Any) -> Reconstruction:
+        """Do the iterations and return the reconstruction, see `Loop.run`; scatter is estimated before some of them."""
+        if self._body is None:
+            return super().run(step, **settings)
+
+        def step_with_scatter(number: int, values: Array, progress: Progress | None) -> tuple[Array, float]:
+            """Estimate the scatter if it is due, and do the iteration."""
+            if number and number & (number - 1) == 0 and self._change >= _SETTLED:
+                self._estimate_scatter(values, part_of(progress, 0, 2))
+                progress = part_of(progress, 1, 2)
+            return step(number, values, progress)
+
+        result = super().run(step_with_scatter, **settings, scatter="body")
+        if self._change >= _SETTLED:
+            state = f"still changed by {self._change:.1%}" if np.isfinite(self._change) else "was not estimated yet"
+            warn(f"scatter: it {state}: do more iterations, or resume", 4)
+        return result
+
+    @property
+    def _change(self) -> float:
+        """Change of the modules' scatter by its last estimate, as a share of it; infinite before the second."""
+        return float(self.state.get("scatter_change", np.inf))
+
+    def _estimate_scatter(self, values: Array, progress: Progress | None) -> None:
+        """Replace the scatter in the background by that of a volume, whose images the last call of `objective` made."""
+        assert self._body is not None and self._images is not None
+        expected = float((self._given.counts - self._given.background).sum(dtype=float))
+        scatter = estimate_scatter(self._A, self._body, values, self._images, expected, progress)
+        if "scatter" in self.state:
+            sums, old = (images.sum(axis=(1, 2), dtype=float) for images in (scatter, self.state["scatter"]))
+            self.state["scatter_change"] = np.array(np.abs(sums - old).sum() / max(sums.sum(), 1e-30))
+        self.state["scatter"] = scatter
+        self._add_scatter()
+        self._objective_of(values, self._images)
+
+    def _add_scatter(self) -> None:
+        """Set the background of all subsets to that which is given and the scatter in the state."""
+        scatter = self.state.get("scatter", np.float32(0))
+        self.data = replace(self._given, background=self._given.background + scatter).without_dead_pixels(self._A)
+        self.subsets = [(projector, self.data[projector.which]) for projector, _ in self.subsets]
+
     def record(self) -> dict[str, Any]:
         """Return the number of subsets, the sums of counts, background and sensitivity, and the prior's settings."""
-        arrays = {"counts": self.data.counts, "background": self.data.background, "sensitivity": self.sensitivity}
+        arrays = {"counts": self._given.counts, "background": self._given.background, "sensitivity": self.sensitivity}
         sums = {name: float(numbers.sum(dtype=float)) for name, numbers in arrays.items()}
         return {"subsets": len(self.subsets), **sums} | ({"prior": None} if self.prior is None else self.prior.record())
 

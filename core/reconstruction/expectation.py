@@ -35,6 +35,7 @@ def mlem(
     iterations: int = 50,
     background: ArrayLike = 0.0,
     *options: Any,
+    scatter: str = "none",
     prior: Prior | None = None,
     **named: Unpack[IterativeOptions],
 ) -> Reconstruction:
@@ -79,7 +80,7 @@ def mlem(
     P. J. Green, "Bayesian reconstructions from emission tomography data using a modified EM algorithm", IEEE Transactions on
     Medical Imaging 9 (1990) 84-93.
     """
-    return _em(CountLoop("MLEM", A, counts, iterations, 1, prior, background, *options, **named))
+    return _em(CountLoop("MLEM", A, counts, iterations, 1, prior, background, *options, scatter=scatter, **named))
 
 
 @argument("subsets", int, "Number of subsets of the modules; each update of an iteration uses one subset",
@@ -92,6 +93,7 @@ def osem(
     prior: Prior | None = None,
     background: ArrayLike = 0.0,
     *options: Any,
+    scatter: str = "none",
     **named: Unpack[IterativeOptions],
 ) -> Reconstruction:
     """Reconstruct the activity of approximately maximum likelihood by an MLEM update for each subset of the views (OSEM).
@@ -106,7 +108,7 @@ def osem(
     H. M. Hudson, R. S. Larkin, "Accelerated image reconstruction using ordered subsets of projection data", IEEE
     Transactions on Medical Imaging 13 (1994) 601-609.
     """
-    return _em(CountLoop("OSEM", A, counts, iterations, subsets, prior, background, *options, **named))
+    return _em(CountLoop("OSEM", A, counts, iterations, subsets, prior, background, *options, scatter=scatter, **named))
 
 
 def _em(loop: CountLoop) -> Reconstruction:

@@ -4,13 +4,16 @@ from typing import Any
 
 import numpy as np
 
-from ..arrays import Array, Floats32
+from ..arrays import Array, Bools, Floats32
 from ..errors import InputError
 from ..models.photon_lines import mu_volumes
+from ..physics.ct_numbers import hu_to_mu
+from ..physics.materials import attenuation
 from ..progress import Progress
 from ..projector import Projector
 from ..scatter.images import scatter_images
 from ..validation import one_of
+from ..volumes.resampling import resample
 from ..volumes.volume import Volume
 from .arguments import argument
 
@@ -19,7 +22,8 @@ SCATTER = {
     "body": ("In the Body", "Photons scattered in the attenuating body, simulated from the volume as it becomes known"),
 }
 """Ways to estimate scatter, each with its label and its description."""
-_PRECISION = 0.005  # of each module's total
+_PRECISION = 0.01  # of each module's total
+_IN_AIR = 0.05  # share of water's mu up to which a voxel is air: noise of a CT, less than lungs
 _NEEDED = {
     "mu": "mu (attenuation.file, --mu)",
     "isotope": "isotope (--set model.isotope=Tc-99m)",
@@ -28,8 +32,8 @@ _NEEDED = {
 
 
 @argument("scatter", str, "Scatter that is estimated and added to the background", words=SCATTER)
-def scatter_body(scatter: str, A: Projector) -> Volume | None:
-    """Return the body, CT numbers or mu at the main line, in which a model's photons scatter; None for `scatter` "none".
+def scatter_body(scatter: str, A: Projector) -> tuple[Volume, Bools] | None:
+    """Return the body of mu in which a model's photons scatter, and the projector's voxels in it; None for "none".
 
     Raise `InputError` for another word, and unless the model has a body and knows the photons' energies.
     """
@@ -41,20 +45,24 @@ def scatter_body(scatter: str, A: Projector) -> Volume | None:
         raise InputError(f"scatter: body needs {', '.join(missing)}, which the model has not")
     main = max(model.isotope.lines_within(*model.window), key=lambda line: line[1])[0]
     volumes = mu_volumes(model.mu)
-    return volumes[[energy for energy, _ in model.photon_lines].index(main)] if len(volumes) > 1 else volumes[0]
+    body = volumes[[energy for energy, _ in model.photon_lines].index(main)] if len(volumes) > 1 else volumes[0]
+    body = hu_to_mu(body, main) if body.quantity == "hu" else body
+    return body, resample(body, A.grid).array > _IN_AIR * attenuation("water", main)
 
 
 def estimate_scatter(
-    A: Projector, body: Volume, values: Array, images: Array, expected: float, progress: Progress | None
+    A: Projector, body: Volume, inside: Bools, values: Array, expected: float, progress: Progress | None
 ) -> Floats32:
-    """Return the expected scatter (M, n_v, n_u) of activity like `values`, whose images without scatter are `images`.
+    """Return the expected scatter (M, n_v, n_u) in a body of activity like `values` in the voxels `inside` it.
 
-    Its size is such that both together are the `expected` counts of all pixels. So it hardly depends on how far the volume
-    has already become smaller, since it need no longer explain the scatter.
+    Its size is such that this activity's images and their scatter together are the `expected` counts of all pixels. So
+    neither the size of a volume that still explains scatter matters, nor what of it lies in the air.
     """
-    activity, model = Volume(values, A.grid, "activity"), A.model
-    scatter: Any = scatter_images(
-        activity, body, A.views, model, precision=_PRECISION, threads=A.threads, progress=progress
-    )
-    total = images.sum(dtype=float) + scatter.images.sum(dtype=float)
-    return scatter.images[0] * np.float32(max(0.0, expected) / max(total, 1e-30))
+    values = np.where(inside, values, np.float32(0))
+    model: Any = A.model
+    scatter = scatter_images(
+        Volume(values, A.grid, "activity"), body, A.views, model, precision=_PRECISION, threads=A.threads,
+        progress=progress,
+    ).images[0]  # fmt: skip
+    total = np.sum(A(values), dtype=float) + np.sum(scatter, dtype=float)
+    return scatter * np.float32(max(0.0, expected) / max(total, 1e-30))

@@ -57,7 +57,7 @@ def bsrem(
 
     Parameters
     ----------
-    A, counts, iterations, background
+    A, counts, iterations, background, scatter
         See `mlem`.
     subsets : int, optional
         Number of subsets; by default about a fifth of the number of views.

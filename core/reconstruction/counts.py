@@ -100,8 +100,8 @@ class CountLoop(Loop):
     subsets : int, optional
         Number of subsets; by default about a fifth of the number of views.
     scatter : str
-        Scatter that is estimated, see `mlem`. The estimate is made after iterations 1, 2, 4, 8 and so on, until it changes by
-        less than 1 %: early volumes, which change fast, soon have another one, and late ones are hardly simulated again.
+        Scatter that is estimated, see `mlem`. Volumes change fast at first, therefore the estimates are due after 1, 2, 4,
+        8 and so on iterations. They do not depend on where a reconstruction was resumed.
     options, named
         See `IterativeOptions`.
 
@@ -217,7 +217,7 @@ class CountLoop(Loop):
         """Replace the scatter in the background by that of a volume, whose images the last call of `objective` made."""
         assert self._body is not None and self._images is not None
         expected = float((self._given.counts - self._given.background).sum(dtype=float))
-        scatter = estimate_scatter(self._A, self._body, values, self._images, expected, progress)
+        scatter = estimate_scatter(self._A, *self._body, values, expected, progress)
         if "scatter" in self.state:
             sums, old = (images.sum(axis=(1, 2), dtype=float) for images in (scatter, self.state["scatter"]))
             self.state["scatter_change"] = np.array(np.abs(sums - old).sum() / max(sums.sum(), 1e-30))

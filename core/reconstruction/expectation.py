@@ -58,6 +58,11 @@ def mlem(
         to the sensitivity in the divisor. The divisor is at least a tenth of the sensitivity, so that the volume stays
         positive and no update is more than ten times as large as without a prior. The penalised likelihood may fall;
         `bsrem` maximises it.
+    scatter : str
+        "body": photons that are scattered in the body of `A.model.mu` are expected besides the background. They are
+        simulated (`scatter_images`) from the volume after 1, 2, 4, 8 and so on iterations, until the modules' totals change
+        by less than 1 %, so that the objective is of another background after each of them. The model needs `mu`,
+        `isotope` and `energy_fwhm`. "none": the background holds all.
 
     Returns
     -------
@@ -70,7 +75,13 @@ def mlem(
     ------
     InputError
         Counts, background, start or mask have a wrong shape or grid, or are negative or not finite; `prior` is no prior, or
-        its anatomy has another grid; `start` is a reconstruction from other data, another model or other arguments.
+        its anatomy has another grid; `start` is a reconstruction from other data, another model or other arguments; the
+        model lacks what `scatter` needs.
+
+    Warns
+    -----
+    InputWarning
+        The iterations ended before the estimate of scatter was final, or the background holds images, perhaps of scatter.
 
     References
     ----------

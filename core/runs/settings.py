@@ -51,7 +51,7 @@ _BY_NAME = "As it attenuates the isotope's photons"
 
 _OF_MODULES = ", one number or one for each module that is used"
 _ARGUMENTS = argument_settings((
-    *("background", "relaxation", "step_decay", "photons", "nonnegative"),
+    *("background", "scatter", "relaxation", "step_decay", "photons", "nonnegative"),
     *("prior", "weight", "gamma", "edge", "anatomy"),
 ))  # fmt: skip
 """Settings of the arguments of methods and priors, in the order of panels and recipe files; new arguments follow."""

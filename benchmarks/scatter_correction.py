@@ -27,7 +27,7 @@ ITERATIONS, SUBSETS = 10, 4
 class Study:
     """Counts of the torso, and regions in which reconstructions of them are compared."""
 
-    def __init__(self, modules: int = 16, voxel: float = 8.0, pixels: int = 20, precision: float = 0.005) -> None:
+    def __init__(self, modules: int = 16, voxel: float = 8.0, pixels: int = 20, precision: float = 0.0025) -> None:
         turn = np.arange(modules) * 2.4  # rad, the golden angle
         sides = [230 * np.cos(turn), 230 * np.sin(turn), 60.0 * (np.arange(modules) % 3 - 1)]
         system = mph.PinholeSystem(CENTER + np.stack(sides, axis=1), 6.0, 110.0, 200.0, 9.0, 80.0)

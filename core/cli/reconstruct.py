@@ -120,9 +120,13 @@ def _run(arguments: argparse.Namespace) -> None:
 
 
 def settings_line(reconstruction: mph.Reconstruction) -> str:
-    """Return the numbers of iterations and subsets of a reconstruction, as a picture shows them; "" if it has none."""
-    subsets = reconstruction.settings.get("subsets", 1)
-    texts = (iterations_text(reconstruction.iterations), f"{subsets} subsets" if subsets > 1 else "")
+    """Return the numbers of iterations and subsets, and the scatter, of a reconstruction in words; "" if it has none."""
+    settings, scatter = reconstruction.settings, reconstruction.state.get("scatter")
+    subsets = settings.get("subsets", 1)
+    share = (
+        "" if scatter is None else f"scatter {scatter.sum(dtype=float) / max(1, settings['counts']):.1%} of the counts"
+    )
+    texts = (iterations_text(reconstruction.iterations), f"{subsets} subsets" if subsets > 1 else "", share)
     return ", ".join(filter(None, texts))
 
 

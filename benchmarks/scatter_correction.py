@@ -21,7 +21,7 @@ from mphdrr.core.physics.energy_window import peak_shares
 
 CENTER = np.array([35.0, -30.0, 0.0])  # of the body between the modules, mm
 LESION = np.array([70.0, -80.0, 10.0])
-ITERATIONS, SUBSETS = 10, 4
+ITERATIONS, SUBSETS = 10, 8
 
 
 class Study:

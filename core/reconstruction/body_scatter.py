@@ -6,12 +6,11 @@ import numpy as np
 
 from ..arrays import Array, Bools, Floats32
 from ..errors import InputError
-from ..models.photon_lines import mu_volumes
 from ..physics.ct_numbers import hu_to_mu
 from ..physics.materials import attenuation
 from ..progress import Progress
 from ..projector import Projector
-from ..scatter.images import scatter_images
+from ..scatter.images import scatter_images, scattering_body, strongest_line
 from ..validation import one_of
 from ..volumes.resampling import resample
 from ..volumes.volume import Volume
@@ -43,11 +42,9 @@ def scatter_body(scatter: str, A: Projector) -> tuple[Volume, Bools] | None:
     model: Any = A.model
     if missing := [text for name, text in _NEEDED.items() if getattr(model, name, None) is None]:
         raise InputError(f"scatter: body needs {', '.join(missing)}, which the model has not")
-    main = max(model.isotope.lines_within(*model.window), key=lambda line: line[1])[0]
-    volumes = mu_volumes(model.mu)
-    body = volumes[[energy for energy, _ in model.photon_lines].index(main)] if len(volumes) > 1 else volumes[0]
-    body = hu_to_mu(body, main) if body.quantity == "hu" else body
-    return body, resample(body, A.grid).array > _IN_AIR * attenuation("water", main)
+    body, energy = scattering_body(model), strongest_line(model)
+    body = hu_to_mu(body, energy) if body.quantity == "hu" else body
+    return body, resample(body, A.grid).array > _IN_AIR * attenuation("water", energy)
 
 
 def estimate_scatter(

@@ -162,10 +162,10 @@ def scattering_body(model: Emission) -> Volume:
             "scatter: the model has no attenuation, in which photons scatter: give mu (--mu FILE, --phantom-mu)"
         )
     energies = [energy for energy, _ in model.photon_lines]
-    return volumes[0] if len(volumes) == 1 else volumes[energies.index(_strongest_line(model))]
+    return volumes[0] if len(volumes) == 1 else volumes[energies.index(strongest_line(model))]
 
 
-def _strongest_line(model: Emission) -> float:
+def strongest_line(model: Emission) -> float:
     """Return the energy, keV, of the strongest line in the window of a model with an isotope."""
     isotope: Any = model.isotope
     window: Any = model.window
@@ -199,7 +199,7 @@ class _Run:
         self._views, self._model, self._windows, self._threads = views, model, windows, threads
         isotope: Any = model.isotope
         lines = [line for line in (*isotope.lines, *isotope.weak_lines) if line[0] > LOWEST_ENERGY]
-        self._reference = _strongest_line(model)
+        self._reference = strongest_line(model)
         self._body, self._source = Body.of(body, self._reference), PhotonSource.of(activity, lines)
         self._energies = self._table_energies(max(energy for energy, _ in lines), spectra)
         cell_of, self._cells = _cells(self._body.grid)

@@ -140,6 +140,7 @@ if TYPE_CHECKING:
     from .xray.dose import absorbed_dose, absorbed_dose_rate, isocentre_kerma
     from .xray.motion import Motion, MotionFinder, find_change, find_motion
     from .xray.scan import SpectralScan
+    from .xray.scatter import XrayScatter, xray_scatter
     from .xray.spectra import Spectrum, tube_spectrum
     from .xray.spectral import SpectralTransmission, panel_blur, water_and_bone
     from .xray.system import XraySystem

@@ -17,9 +17,11 @@ from ..volumes.volume import Volume, require_quantity
 
 SCATTERERS = (Scatterer("water"), Scatterer("bone"))
 LOWEST_ENERGY = 30.0
-"""Energy, keV, below which photons are not followed."""
+"""Energy, keV, below which photons of activity are not followed."""
+LOWEST_XRAY_ENERGY = 10.0
+"""Energy, keV, below which photons of tubes are not followed."""
 _MOMENTA = 2048
-_ENERGIES = np.geomspace(LOWEST_ENERGY, HIGHEST_ENERGY, 64)
+_ENERGIES = np.geomspace(LOWEST_XRAY_ENERGY, HIGHEST_ENERGY, 84)
 
 
 @dataclass(frozen=True, eq=False)

@@ -3,7 +3,7 @@
 import ctypes
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -55,13 +55,11 @@ class PhotonSource:
     def starts(self, first: int, end: int, seed: int, all_first: int) -> Array:
         """Return the photons from number `first` to `end` of those from `all_first` on, as `rays.backends.cpu.START`.
 
-        Places, directions, energies and first collisions are quasi-random: points of a Kronecker sequence that `seed` and
-        `all_first` shift at random, so that each set of them is an unbiased sample of its own.
+        Places, directions, energies and first collisions are `quasi_random`.
         """
         from ..rays.backends.cpu import START
 
-        shift = np.random.default_rng([seed, all_first, 1]).random(len(_STEPS))
-        shares = (np.arange(first - all_first, end - all_first)[:, None] * _STEPS + shift) % 1
+        shares = quasi_random(first, end, seed, all_first)
         inside = np.random.default_rng([seed, first, 2]).random((end - first, 3)) - 0.5
         if not len(self.voxels):
             return np.empty(0, START)
@@ -74,25 +72,44 @@ class PhotonSource:
         starts["direction"] = np.stack([sine * np.cos(azimuth), sine * np.sin(azimuth), cosine], axis=-1)
         energies, until = self.lines
         starts["energy"] = energies[np.minimum(np.searchsorted(until, shares[:, 4], side="right"), len(energies) - 1)]
-        starts["collides_at"] = np.clip(shares[:, 3], 1e-12, 1 - 1e-12)
+        starts["collides_at"] = shares[:, 3]
+        starts["weight"] = 1.0
         return starts
 
 
+def quasi_random(first: int, end: int, seed: int, all_first: int) -> Floats:
+    """Return points (n, 5), numbers above 0 and below 1, for the photons from `first` to `end` of those from `all_first` on.
+
+    They are points of a Kronecker sequence that `seed` and `all_first` shift at random, so that each set of them is an
+    unbiased sample of its own.
+    """
+    shift = np.random.default_rng([seed, all_first, 1]).random(len(_STEPS))
+    points = (np.arange(first - all_first, end - all_first)[:, None] * _STEPS + shift) % 1
+    return np.clip(points, 1e-12, 1 - 1e-12)
+
+
+class Beginnings(Protocol):
+    """Photons that begin, such as those of a `PhotonSource`."""
+
+    def starts(self, first: int, end: int, seed: int, all_first: int) -> Array:
+        """Return the photons from number `first` to `end` of those from `all_first` on, as `rays.backends.cpu.START`."""
+
+
 class Histories:
-    """Histories of the photons of a source in a body, and what modules see of them.
+    """Histories of the photons of a source in a body, and what modules or a panel see of them.
 
     Parameters
     ----------
     body, source
         Where photons scatter, and where they begin.
     modules : array (M,)
-        Holes and what they see, of the type `rays.backends.cpu.MODULE`.
+        Holes and what they see, of the type `rays.backends.cpu.MODULE`; or one panel, of the type `PANEL` there.
     energies : array (n,)
         Evenly spaced energies, keV, of the tables; photons below the first are not followed.
     accepted : array (M, W, n)
         Shares of the photons of these energies that are counted in each window.
     cell_of, cells
-        Numbers of the cells of the body's voxels, and of all cells.
+        Numbers of the cells of the body's voxels, and of all cells; of a panel its bins are the cells.
     orders : int
         Number of orders of scattering that are kept apart; the last has all from it on.
     seed, threads : int
@@ -104,7 +121,7 @@ class Histories:
     def __init__(
         self,
         body: Body,
-        source: PhotonSource,
+        source: Beginnings,
         modules: Array,
         energies: Floats,
         accepted: Floats32,
@@ -129,7 +146,7 @@ class Histories:
         ]  # fmt: skip  # they live as long as the jobs that point at them
         names = (
             *("body", "coefficients", "incoherent", "coherent", "coherent_until"),
-            *("holes", "accepted", "cell_of", "seen"),
+            *("panel" if modules.dtype == self._kernels.PANEL else "holes", "accepted", "cell_of", "seen"),
         )
         numbers = {name: array.ctypes.data for name, array in zip(names, self._arrays, strict=True)}
         step = float(energies[1] - energies[0])
@@ -184,7 +201,8 @@ class Histories:
         """Add what the modules from `first` to `end` see of the collisions."""
         job = self._kernels.PhotonJob.from_buffer_copy(job_with_arrays[0])
         job.first_module, job.last_module = first, end
-        self._kernels.library.see(self._kernels.level, ctypes.byref(job))
+        see = self._kernels.library.see_panel if job.panel else self._kernels.library.see
+        see(self._kernels.level, ctypes.byref(job))
 
 
 def _kernels() -> Any:

@@ -10,6 +10,7 @@ from ..arrays import Array, ArrayLike, Floats, Floats32, Indexes
 from ..errors import InputError, naming
 from ..geometry.grid import Grid
 from ..geometry.views import Views
+from ..models.model import checked_background, with_image_axes
 from ..physics.ct_numbers import CT_ENERGY, hu_to_mu
 from ..physics.materials import attenuation
 from ..progress import Progress, part_of
@@ -17,7 +18,7 @@ from ..projector import Model, Projector, Transmission
 from ..rays.bundles import Beam
 from ..volumes.volume import Volume
 from .decomposition import correct_beam_hardening, virtual_monoenergetic
-from .detectors import EnergyIntegrator, PanelDetector, PhotonCounter
+from .detectors import Bins, EnergyIntegrator, PanelDetector, PhotonCounter
 from .spectra import Spectrum, tube_spectrum
 from .spectral import SpectralTransmission, panel_blur, water_and_bone
 from .system import XraySystem, filter_thicknesses
@@ -49,8 +50,8 @@ class SpectralScan(Model):
         Energy resolution of a counting panel, keV.
     intrinsic_fwhm : float
         Blur of the panel, mm, besides that of the focal spots (`panel_blur`).
-    background : float
-        Counts of each pixel besides those of the spectrum, such as scatter.
+    background : float or array (M,) or (M, n_v, n_u)
+        Counts of each pixel besides those of the spectrum, such as scatter (`xray_scatter`).
     spectrum : Spectrum or None
         Spectrum to use instead of those of the tubes.
     """
@@ -63,7 +64,7 @@ class SpectralScan(Model):
     sensor_thickness: float = 2.0
     sensor_fwhm: float = 0.0
     intrinsic_fwhm: float = 0.0
-    background: float = 0.0
+    background: float | Floats = 0.0
     spectrum: Spectrum | None = None
 
     name = "spectral"
@@ -74,6 +75,8 @@ class SpectralScan(Model):
         if not isinstance(self.system, XraySystem):
             kind = getattr(self.system, "kind", type(self.system).__name__)
             raise InputError(f"spectral: expected a scanner of X-ray tubes and panels, got one of the kind {kind}")
+        background = checked_background(self.background, "spectral: background", len(self.system))
+        object.__setattr__(self, "background", background)
         for _ in self.transmissions(self.system.views((1, 1))):  # refuses spectra outside the table, empty windows
             pass
 
@@ -90,6 +93,7 @@ class SpectralScan(Model):
         """Raise `InputError` unless there is one view for each source."""
         if len(views) != len(self.system):
             raise InputError(f"spectral: expected {len(self.system)} views, one of each source, got {len(views)}")
+        checked_background(self.background, "spectral: background", len(views), views.shape)
 
     def linear(self) -> Model:
         """Return the model of the line integrals that `line_integrals` makes of the images."""
@@ -143,7 +147,8 @@ class SpectralScan(Model):
         If not `corrected` for beam hardening they are mere logarithms, of mu at no particular energy. Pixels without photons
         are treated as having half a count.
         """
-        measured = np.maximum(np.asarray(images, np.float64) - self.background, 0.5)
+        self.check(views)
+        measured = np.maximum(np.asarray(images, np.float64) - with_image_axes(self.background), 0.5)
         result = np.empty(measured.shape, np.float32)
         for indices, m in self.transmissions(views, ("water",)):
             mAs, signal = self.system.mas[indices], measured[None, indices]
@@ -160,15 +165,32 @@ class SpectralScan(Model):
 
         `materials` are by default those of the scan.
         """
-        system, bins = self.system, _ALL_ENERGIES if self.window is None else (self.window,)
+        blurs = panel_blur(self.system, self.intrinsic_fwhm)
+        for indices, spectrum in self.spectra():
+            with naming(f"X-ray source {self.system.numbers[indices[0]]}"):
+                arguments = (materials or self._names, self._bins, self._detector())
+                yield indices, SpectralTransmission(views[indices], spectrum, *arguments, blurs[indices])
+
+    def spectra(self) -> Iterator[tuple[Indexes, Spectrum]]:
+        """Yield each spectrum of the tubes, behind their filters, with the indices of its views."""
+        system = self.system
         tubes = list(zip(system.kvp.tolist(), system.filters.tolist(), strict=True))
-        blurs = panel_blur(system, self.intrinsic_fwhm)
         for tube in dict.fromkeys(tubes):
             indices = np.flatnonzero([view_tube == tube for view_tube in tubes])
             with naming(f"X-ray source {system.numbers[indices[0]]}"):
                 spectrum = self.spectrum or tube_spectrum(tube[0], filter_thicknesses(tube[1]))
-                arguments = (materials or self._names, bins if self.panel == "counting" else None, self._detector())
-                yield indices, SpectralTransmission(views[indices], spectrum, *arguments, blurs[indices])
+            yield indices, spectrum
+
+    def photon_signals(self, energies: Floats) -> Floats:
+        """Return the signal (n,), in the unit of `unit`, of one photon of each energy (n,), keV, that hits a pixel."""
+        return self._detector().response(energies, self._bins)[0]
+
+    @property
+    def _bins(self) -> Bins | None:
+        """Energies, keV, of the photons that are counted; None for a panel that integrates the energy."""
+        if self.panel != "counting":
+            return None
+        return _ALL_ENERGIES if self.window is None else (self.window,)
 
     def _detector(self) -> PanelDetector:
         """Return the detector of the panels' pixels."""

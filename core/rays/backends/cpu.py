@@ -23,7 +23,7 @@ from ..ray_geometry import Attenuation, IndexFans, IndexRays, Rays
 LEVEL_VARIABLE = "MPHDRR_CPU_LEVEL"
 """Environment variable with the name of a lower level of processor, of `levels`, than this one's."""
 
-_CONTRACT = 11
+_CONTRACT = 12
 _NAMES = {"win32": "siddon.dll", "darwin": "libsiddon.dylib"}
 _MAX_VOXELS = 2**31 - 1  # their indices have 32 bits
 _PRODUCT = 2  # in kernels.h
@@ -97,10 +97,13 @@ class PhotonJob(Structure):
         ("followed", c_void_p), ("n_collisions", c_void_p), ("holes", c_void_p), ("modules", c_int64),
         ("first_module", c_int64), ("last_module", c_int64), ("accepted", c_void_p), ("windows", c_int64),
         ("orders", c_int64), ("cell_of", c_void_p), ("cells", c_int64), ("seen", c_void_p), ("spectra", c_void_p),
+        ("panel", c_void_p),
     ]  # fmt: skip
 
 
-START = np.dtype([("place", "3f8"), ("direction", "3f8"), ("energy", "f8"), ("collides_at", "f8")])
+START = np.dtype([
+    ("place", "3f8"), ("direction", "3f8"), ("energy", "f8"), ("collides_at", "f8"), ("weight", "f8"),
+])  # fmt: skip
 """A photon that begins, as kernels.h has it: `Start`."""
 MODULE = np.dtype([
     ("hole", "3f8"), ("u", "3f8"), ("v", "3f8"), ("axis", "3f8"), ("slopes", "4f8"), ("margin", "f8"),
@@ -108,6 +111,10 @@ MODULE = np.dtype([
     ("least", "f8"),
 ])  # fmt: skip
 """A module that sees photons, as kernels.h has it: `Module`."""
+PANEL = np.dtype([
+    ("corner", "3f8"), ("u", "3f8"), ("v", "3f8"), ("area", "3f8"), ("columns", "i8"), ("rows", "i8"), ("places", "i8"),
+])  # fmt: skip
+"""A panel that sees photons, as kernels.h has it: `Panel`."""
 COLLISION = np.dtype([
     ("place", "3f8"), ("direction", "3f8"), ("energy", "f8"), ("weight", "f4"), ("voxel", "i4"), ("order", "i4"),
 ], align=True)  # fmt: skip
@@ -119,7 +126,7 @@ _KERNELS = {
     DepthJob: ("voxels_to_cells", "cells_to_voxels", "cells_to_pixels", "pixels_to_cells",
                "differentiate_places", "differentiate_taps"),
     PlacesJob: ("take_at", "give_at"),
-    PhotonJob: ("follow", "see"),
+    PhotonJob: ("follow", "see", "see_panel"),
 }  # fmt: skip
 
 

@@ -18,7 +18,7 @@
 
 #define NODE_ROWS 4
 #define GIVEN_ROWS 16
-#define CONTRACT 11 // increased with every change of the code of this file: cpu.py refuses any other
+#define CONTRACT 12 // increased with every change of the code of this file: cpu.py refuses any other
 
 // Voxels (n[0], n[1], n[2]) in C order, float or double as the job says.
 typedef struct {
@@ -136,6 +136,7 @@ typedef struct {
 typedef struct {
     double place[3], direction[3], energy; // of the photon when it begins
     double collides_at;                    // quantile of its first collision along the way through the body, above 0 and below 1
+    double weight;                         // photons that it stands for
 } Start;
 
 typedef struct {
@@ -152,6 +153,13 @@ typedef struct {
     double area;                         // d_e^2 / 16, mm^2
     double least;                        // photons through the hole, of one history: contributions below play roulette for so many
 } Module;
+
+typedef struct {
+    double corner[3], u[3], v[3]; // outer corner, and the ways along all of a row and all of a column
+    double area[3];               // normal that points away from what is seen, times the panel's area, mm^2
+    int64_t columns, rows;        // of bins, the job's cells, row by row
+    int64_t places;               // number of places of the panel that each collision sees
+} Panel;
 
 typedef struct {
     int64_t is_double; // 0: there are no kernels of double
@@ -179,6 +187,7 @@ typedef struct {
     int64_t cells;
     float *seen;                       // (orders, windows, cells, modules): photons of an even emission that would be seen alike
     double *spectra;                   // (modules, energies): photons that pass the hole; or null
+    const Panel *panel;                // of see_panel, the only module
 } PhotonJob;
 
 // Highest level of kernels that this processor supports; any processor of the platform runs level 0.
@@ -221,6 +230,7 @@ void take_at(int64_t level, const PlacesJob *job);
 // the single array += the points' numbers, shared out: the adjoint of the sum in take_at
 void give_at(int64_t level, const PlacesJob *job);
 
-// collisions = those of the histories; and seen += what the modules see of the collisions
+// collisions = those of the histories; and seen += what the modules see of the collisions, or photons in the bins of the panel
 void follow(int64_t level, const PhotonJob *job);
 void see(int64_t level, const PhotonJob *job);
+void see_panel(int64_t level, const PhotonJob *job);

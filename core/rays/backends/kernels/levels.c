@@ -58,6 +58,7 @@ DISPATCH(take_at, PlacesJob)
 DISPATCH(give_at, PlacesJob)
 DISPATCH_TO(follow, PhotonJob, level, EACH_FLOAT(follow))
 DISPATCH_TO(see, PhotonJob, level, EACH_FLOAT(see))
+DISPATCH_TO(see_panel, PhotonJob, level, EACH_FLOAT(see_panel))
 
 EXPORT const char *level_name(int64_t level) {
     return level < (int64_t)(sizeof(names) / sizeof(names[0])) ? names[level] : 0;

@@ -1,4 +1,4 @@
-// Photons that scatter in a body: their flights and collisions, and what modules see of each collision (docs/scatter.md).
+// Photons that scatter in a body: their flights and collisions, and what modules and panels see of each collision (docs/scatter.md).
 
 #include "kernels.h"
 
@@ -206,7 +206,7 @@ void KERNEL(follow)(const PhotonJob *job) {
         const Start *start = job->starts + (history - job->all_first);
         double place[3], direction[3], energy = start->energy;
         for (int i = 0; i < 3; i++) place[i] = start->place[i], direction[i] = start->direction[i];
-        float weight = 1;
+        float weight = (float)start->weight;
         for (int order = 1; order <= MOST_COLLISIONS; order++) {
             const Between at = energy_place(job, energy);
             float mu[MATERIALS], paths[MATERIALS], left;
@@ -252,7 +252,45 @@ void KERNEL(follow)(const PhotonJob *job) {
     *job->followed = history, *job->n_collisions = n;
 }
 
-// --- what modules see ----------------------------------------------------------------------------------------------------------
+// --- what modules and panels see -----------------------------------------------------------------------------------------------
+
+// What a collision scatters towards a direction: numbers by which its weight in an even emission, of 1 photon, is multiplied.
+typedef struct {
+    double cosine, after; // keV after Compton scattering
+    Between loses;
+    float compton, rayleigh, mu_after[MATERIALS];
+} Sight;
+
+typedef struct {
+    Between energy;
+    float mu[MATERIALS], total;
+} Before;
+
+INLINE Before before_collision(const PhotonJob *job, const Collision *c) {
+    Before before = {.energy = energy_place(job, c->energy)};
+    for (int a = 0; a < MATERIALS; a++) {
+        before.mu[a] = coefficient(job, TOTAL, a, before.energy);
+        before.total += job->body[MATERIALS * c->voxel + a] * before.mu[a];
+    }
+    return before;
+}
+
+INLINE Sight towards(const PhotonJob *job, const Collision *c, const double *to) {
+    Sight sight = {.cosine = MIN(MAX(dot(to, c->direction), -1.0), 1.0)};
+    const double cosine = sight.cosine, after = sight.after = compton_energy(c->energy, cosine);
+    const Between x = momentum_place(job, momentum(c->energy, cosine)), loses = sight.loses = energy_place(job, after);
+    const float *densities = job->body + MATERIALS * c->voxel;
+    float incoherent = 0, coherent = 0;
+    for (int a = 0; a < MATERIALS; a++) {
+        sight.mu_after[a] = coefficient(job, TOTAL, a, loses);
+        incoherent += densities[a] * in(job->incoherent + a * job->momenta, x);
+        coherent += densities[a] * in(job->coherent + a * job->momenta, x);
+    }
+    const double ratio = after / c->energy, square = cosine * cosine;
+    sight.compton = incoherent * (float)(ratio * ratio * (ratio + 1 / ratio - 1 + square));
+    sight.rayleigh = coherent * (float)(1 + square);
+    return sight;
+}
 
 // The largest share of photons of this energy that any window of a module counts.
 INLINE float counted(const PhotonJob *job, int64_t m, Between at) {
@@ -264,26 +302,32 @@ INLINE float counted(const PhotonJob *job, int64_t m, Between at) {
     return most;
 }
 
-INLINE void record(const PhotonJob *job, const Collision *c, int64_t m, double energy, float weight, double spectral) {
+INLINE void record(const PhotonJob *job, const Collision *c, int64_t m, int64_t cell, double energy, float weight, double spectral) {
     const Between at = energy_place(job, energy);
     const int64_t orders = job->orders, order = c->order < orders ? c->order - 1 : orders - 1;
     const float *accepted = job->accepted + m * job->windows * job->energies;
     for (int64_t w = 0; w < job->windows; w++) {
-        float *cell = job->seen + ((order * job->windows + w) * job->cells + job->cell_of[c->voxel]) * job->modules + m;
-        *cell += weight * in(accepted + w * job->energies, at);
+        float *sum = job->seen + ((order * job->windows + w) * job->cells + cell) * job->modules + m;
+        *sum += weight * in(accepted + w * job->energies, at);
     }
     if (job->spectra) job->spectra[m * job->energies + at.first + (at.share > 0.5f)] += weight * spectral;
 }
 
+// Record the photons of a weight that a collision scatters along a way through the body, with the energies they then have.
+INLINE void record_sight(const PhotonJob *job, const Collision *c, const Before *before, const Sight *sight, const double *to,
+                         double distance, int64_t m, int64_t cell, float weight, double spectral) {
+    float paths[MATERIALS], left;
+    int64_t voxel;
+    walk(job, c->place, to, distance, sight->mu_after, FAR, paths, &left, &voxel);
+    const float after = exponential(-(paths[0] * sight->mu_after[0] + paths[1] * sight->mu_after[1]));
+    const float kept = exponential(-(paths[0] * before->mu[0] + paths[1] * before->mu[1]));
+    record(job, c, m, cell, sight->after, weight * sight->compton * after, spectral);
+    record(job, c, m, cell, c->energy, weight * sight->rayleigh * kept, spectral);
+}
+
 void KERNEL(see)(const PhotonJob *job) {
     for (const Collision *c = job->collisions; c < job->collisions + *job->n_collisions; c++) {
-        const Between before = energy_place(job, c->energy);
-        const float *densities = job->body + MATERIALS * c->voxel;
-        float mu_before[MATERIALS], total = 0;
-        for (int a = 0; a < MATERIALS; a++) {
-            mu_before[a] = coefficient(job, TOTAL, a, before);
-            total += densities[a] * mu_before[a];
-        }
+        const Before before = before_collision(job, c);
         for (int64_t m = job->first_module; m < job->last_module; m++) {
             const Module *module = &job->holes[m];
             double to[3];
@@ -295,31 +339,40 @@ void KERNEL(see)(const PhotonJob *job) {
             if (!(height > module->nearest && outside < margin)) continue;
             const double distance = __builtin_sqrt(dot(to, to));
             for (int i = 0; i < 3; i++) to[i] /= distance;
-            const double cosine = MIN(MAX(dot(to, c->direction), -1.0), 1.0), after = compton_energy(c->energy, cosine);
-            const Between x = momentum_place(job, momentum(c->energy, cosine)), loses = energy_place(job, after);
-            float paths[MATERIALS], left, mu_after[MATERIALS], incoherent = 0, coherent = 0;
-            for (int a = 0; a < MATERIALS; a++) {
-                mu_after[a] = coefficient(job, TOTAL, a, loses);
-                incoherent += densities[a] * in(job->incoherent + a * job->momenta, x);
-                coherent += densities[a] * in(job->coherent + a * job->momenta, x);
-            }
-            const double ratio = after / c->energy, square = cosine * cosine;
-            float weight = c->weight * (float)(4 * PI) / total;
-            const float compton = incoherent * (float)(ratio * ratio * (ratio + 1 / ratio - 1 + square));
-            const float rayleigh = coherent * (float)(1 + square);
+            const Sight sight = towards(job, c, to);
+            float weight = c->weight * (float)(4 * PI) / before.total;
             const double passes = module->area * height / (distance * distance * distance);
-            const double most = weight * passes * (compton * counted(job, m, loses) + rayleigh * counted(job, m, before));
+            const double most = weight * passes * (sight.compton * counted(job, m, sight.loses) + sight.rayleigh * counted(job, m, before.energy));
             if (most < module->least || most <= 0) { // few photons: not worth the walk every time
                 union { double value; uint64_t bits; } place = {c->place[0]};
                 Random random = mixed(place.bits ^ mixed((uint64_t)m + 1));
                 if (uniform(&random) * module->least >= most) continue;
                 weight *= (float)(module->least / most);
             }
-            int64_t voxel;
-            walk(job, c->place, to, distance, mu_after, FAR, paths, &left, &voxel);
-            const double spectral = outside < 0 ? passes : 0;
-            record(job, c, m, after, weight * compton * exponential(-(paths[0] * mu_after[0] + paths[1] * mu_after[1])), spectral);
-            record(job, c, m, c->energy, weight * rayleigh * exponential(-(paths[0] * mu_before[0] + paths[1] * mu_before[1])), spectral);
+            record_sight(job, c, &before, &sight, to, distance, m, job->cell_of[c->voxel], weight, outside < 0 ? passes : 0);
+        }
+    }
+}
+
+void KERNEL(see_panel)(const PhotonJob *job) {
+    const Panel *panel = job->panel;
+    for (const Collision *c = job->collisions; c < job->collisions + *job->n_collisions; c++) {
+        const Before before = before_collision(job, c);
+        union { double value; uint64_t bits; } place = {c->place[0]};
+        Random random = mixed(place.bits);
+        double u = uniform(&random), v = uniform(&random);
+        for (int64_t p = 0; p < panel->places; p++) {
+            u += 0.7548776662466927, v += 0.5698402909980532; // M. Roberts' R2 sequence, shifted at random
+            u -= u >= 1, v -= v >= 1;
+            double to[3];
+            for (int i = 0; i < 3; i++) to[i] = panel->corner[i] + u * panel->u[i] + v * panel->v[i] - c->place[i];
+            const double distance = __builtin_sqrt(dot(to, to)), seen = dot(to, panel->area);
+            if (!(seen > 0)) continue; // behind the panel
+            for (int i = 0; i < 3; i++) to[i] /= distance;
+            const Sight sight = towards(job, c, to);
+            const double angle = seen / (distance * distance * distance * (double)panel->places);
+            const int64_t cell = (int64_t)(v * (double)panel->rows) * panel->columns + (int64_t)(u * (double)panel->columns);
+            record_sight(job, c, &before, &sight, to, distance, 0, cell, c->weight * (float)angle / before.total, 0);
         }
     }
 }

@@ -47,7 +47,7 @@ class Body:
         share = np.clip((mu - water) / (bone - water), 0, 1)  # of bone
         of_bone = np.where(share < 1, share, mu / bone)
         densities = np.stack([np.maximum(mu - of_bone * bone, 0) / water, of_bone], axis=-1)
-        filled = np.nonzero(mu > 1e-3 * water)  # air is not
+        filled = np.nonzero(mu > 2e-3 * water)  # air is not
         if not len(filled[0]):
             return cls(volume.grid.box((0, 0, 0), (1, 1, 1)), freeze(np.zeros((1, 1, 1, 2), np.float32)))
         first, end = (np.array([f(i) for i in filled]) for f in (np.min, np.max))

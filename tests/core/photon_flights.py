@@ -40,10 +40,11 @@ def sphere(n, rng):
     return np.stack([sine * np.cos(azimuth), sine * np.sin(azimuth), cosine], axis=1)
 
 
-def left(density, spacing, places, energies, rng, lowest=30.0):
-    """Return the photons that leave voxels of water, centred, of those that begin at `places` to all sides."""
+def left(density, spacing, places, energies, rng, lowest=30.0, directions=None):
+    """Return the photons that leave voxels of water, centred, of those that begin at `places` inside, by default to all sides."""
     n, half = np.array(density.shape), np.array(density.shape) * spacing / 2
-    directions, orders, gone = sphere(len(places), rng), np.zeros(len(places), int), []
+    directions = sphere(len(places), rng) if directions is None else directions
+    orders, gone = np.zeros(len(places), int), []
     most = density.max()
     while len(places):
         total, incoherent, coherent = (np.interp(energies, ENERGIES, row) for row in COEFFICIENTS)

@@ -20,8 +20,8 @@ from ..volumes.volume import Volume, require_quantity
 from .scan import WATER_AND_BONE, SpectralScan
 from .spectra import Spectrum
 
-_BINS = 16  # most rows and columns of bins of a panel: scatter is smooth
-_PLACES = 4  # places of the panel that each collision sees
+_BINS = 10  # most rows and columns of bins of a panel: scatter is smooth
+_PLACES = 16  # places of the panel that each collision sees
 _ENERGIES = 512  # number of the energies of the tables
 _ROUNDS = 16  # independent rounds of histories, by whose differences deviations are known
 _PILOT = 256  # histories of a round before the number of further ones is known
@@ -60,8 +60,8 @@ def xray_scatter(
 
     The views are exposed one after another, without a grid. Photons leave each focal spot within the cone to its own panel,
     with the energies of the tube's spectrum behind its filters, and are followed as by `scatter_images`. At each collision
-    the chance that the photon is scattered to each of four random places of the panel, and what remains of it on the way
-    there at its new energy, are added to a grid of at most 16 x 16 bins, with the panel's response. The pixels' images are
+    the chance that the photon is scattered to each of 16 random places of the panel, and what remains of it on the way
+    there at its new energy, are added to a grid of at most 10 x 10 bins, with the panel's response. The pixels' images are
     smooth curves with the same totals in each bin.
 
     Parameters
@@ -75,8 +75,8 @@ def xray_scatter(
     histories : int, optional
         Number of histories of each view. None: as many as `precision` takes.
     precision : float
-        Relative standard deviation of each panel's total, up to which histories go on. That of single bins is some ten times
-        as large.
+        Relative standard deviation of each panel's total, up to which histories go on. That of single bins is some four
+        times as large.
     orders : int
         Number of orders of scattering whose images are kept apart; the last has all from it on.
     seed : int
@@ -99,8 +99,8 @@ def xray_scatter(
 
     Notes
     -----
-    Give the images to the logarithm as the model's background: ``replace(model, background=scatter.images)``. Photons of less
-    than 10 keV, and those that the panel or anything beside the body scatters, are not simulated.
+    Give the images to the logarithm as the model's background: ``replace(model, background=scatter.images)``. Photons of
+    less than 10 keV, and those that the panel or anything beside the body scatters, are not simulated.
     """
     instance(body, Volume, "scatter: body")
     instance(model, SpectralScan, "scatter: model")
@@ -177,7 +177,7 @@ class _Cone:
         """Photons per mAs that a photon of weight 1 stands for, if all places of the panel begin one."""
 
     def _angles(self, ways: Floats) -> Floats:
-        """Return the solid angle (...,) of the panel, sr, if all of it were where `ways` (..., 3), mm, from the source end."""
+        """Return the solid angle (...,) of the panel, sr, if all of it were at the ends of `ways` (..., 3), mm."""
         return ways @ self._area / np.linalg.norm(ways, axis=-1) ** 3
 
     def starts(self, first: int, end: int, seed: int, all_first: int) -> Array:
@@ -229,11 +229,12 @@ def _relative_error(rounds: Floats) -> float:
 def _pixel_shares(bins: int, pixels: int) -> Floats:
     """Return the matrix (pixels, bins) that makes pixels of the sums of bins along an axis, with the same totals.
 
-    In each bin the density is the parabola that has the bin's sum, and means of neighbours at its ends.
+    In each bin the density is the parabola that has the bin's sum, and at its ends the values of the cubics through the sums
+    of the four nearest bins (P. Colella, P. R. Woodward, Journal of Computational Physics 54 (1984) 174).
     """
     until = np.vstack([np.zeros(bins), np.tri(bins)])
-    means = np.pad(np.eye(bins), ((1, 1), (0, 0)), mode="reflect", reflect_type="odd") if bins > 1 else np.ones((3, 1))
-    slopes = (means[1:] + means[:-1]) / 2
+    means = np.pad(np.eye(bins), ((2, 2), (0, 0)), mode="reflect", reflect_type="odd") if bins > 1 else np.ones((5, 1))
+    slopes = (7 * (means[1:-2] + means[2:-1]) - means[:-3] - means[3:]) / 12
     ends = np.linspace(0, bins, pixels + 1)
     first = np.minimum(ends.astype(int), bins - 1)
     t = (ends - first)[:, None]

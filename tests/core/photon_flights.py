@@ -41,7 +41,7 @@ def sphere(n, rng):
 
 
 def left(density, spacing, places, energies, rng, lowest=30.0, directions=None):
-    """Return the photons that leave voxels of water, centred, of those that begin at `places` inside, by default to all sides."""
+    """Return the photons that leave voxels of water, centred, of those that begin at `places`, by default to all sides."""
     n, half = np.array(density.shape), np.array(density.shape) * spacing / 2
     directions = sphere(len(places), rng) if directions is None else directions
     orders, gone = np.zeros(len(places), int), []

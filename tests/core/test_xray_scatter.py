@@ -57,10 +57,12 @@ def panel_places(x, shares):
 def test_first_collisions_are_an_integral_over_cone_body_and_panel(side):
     energy, half = 70.0, np.array([40.0, 50.0, 50.0])
     x = system(side=side)
-    model = mph.SpectralScan(x, spectrum=mph.Spectrum([energy], [1e4]), panel="energy", sensor="CsI", sensor_thickness=0.6)
+    model = mph.SpectralScan(
+        x, spectrum=mph.Spectrum([energy], [1e4]), panel="energy", sensor="CsI", sensor_thickness=0.6
+    )
     body = water(mph.Grid.centered((8, 10, 10), 10.0))
-    result = mph.xray_scatter(body, x.views(), model, orders=2, precision=0.002)
-    shares = qmc.Sobol(5, seed=1).random_base2(18)
+    result = mph.xray_scatter(body, x.views(), model, orders=2, precision=0.003)
+    shares = qmc.Sobol(5, seed=1).random_base2(17)
     source, towards = x.sources[0], panel_places(x, shares[:, :2]) - x.sources[0]
     far = np.linalg.norm(towards, axis=1)
     photons = 2.0 * 1e4 * 1e6 * side**2 * 750.0 / far**3  # mAs, per sr, times the solid angle of the panel
@@ -119,7 +121,10 @@ def flown(body, x, spectrum, panel, n, rng):
     return sums[0], sums[1]
 
 
-SPECTRA = {"one energy": mph.Spectrum([60.0], [1e4]), "three energies": mph.Spectrum([40.0, 70.0, 110.0], [2e4, 3e4, 1e4])}
+SPECTRA = {
+    "one energy": mph.Spectrum([60.0], [1e4]),
+    "three energies": mph.Spectrum([40.0, 70.0, 110.0], [2e4, 3e4, 1e4]),
+}
 
 
 def compare(body, name, panel, n, precision, rng):
@@ -138,7 +143,7 @@ def compare(body, name, panel, n, precision, rng):
 
 @pytest.mark.parametrize(("name", "panel"), [("one energy", "counting"), ("three energies", "energy")])
 def test_panels_see_the_photons_that_really_fly_to_them(name, panel, rng):
-    compare(sphere(75.0, 16, 10.0), name, panel, 250_000, 0.01, rng)
+    compare(sphere(75.0, 16, 10.0), name, panel, 250_000, 0.005, rng)
 
 
 @pytest.mark.long
@@ -163,8 +168,8 @@ def test_the_same_seed_gives_the_same_images_bit_for_bit_by_any_number_of_thread
 def test_finer_pixels_share_the_same_photons():
     body, model = sphere(60.0, 16, 10.0), scan()
     coarse, fine = (mph.xray_scatter(body, model.system.views(shape), model, histories=2000).images[0]
-                    for shape in ((16, 16), (48, 80)))  # fmt: skip
-    np.testing.assert_allclose(fine.reshape(16, 3, 16, 5).sum(axis=(1, 3)), coarse, rtol=2e-5)
+                    for shape in ((10, 10), (30, 50)))  # fmt: skip
+    np.testing.assert_allclose(fine.reshape(10, 3, 10, 5).sum(axis=(1, 3)), coarse, rtol=2e-5)
     odd = mph.xray_scatter(body, model.system.views((1, 50)), model, histories=2000).images
     assert odd.sum() == pytest.approx(coarse.sum(), rel=0.05)
 
@@ -193,8 +198,8 @@ def test_nothing_scatters_in_a_vacuum():
 
 
 def test_fdk_of_a_sphere_is_right_when_the_scatter_is_subtracted():
-    """One view stands for all of a round body; the subtracted scatter has another seed than the one that is measured."""
-    body, model = sphere(70.0, 36, 4.0), scan(shape=(64, 64), panel="energy", sensor="CsI", sensor_thickness=0.6)
+    """One view, the same from all sides, stands for 60; the subtracted scatter has another seed than the measured one."""
+    body, model = sphere(70.0, 18, 8.0), scan(shape=(64, 64), panel="energy", sensor="CsI", sensor_thickness=0.6)
     views, all_views = model.system.views(), system(60, shape=(64, 64)).views()
     source, targets = views.rays(0)
     ways = (targets - source) / np.linalg.norm(targets - source, axis=1, keepdims=True)
@@ -202,7 +207,8 @@ def test_fdk_of_a_sphere_is_right_when_the_scatter_is_subtracted():
     chords = 2 * np.sqrt(np.maximum(70.0**2 - off, 0)).reshape(1, 64, 64)
     _, transmission = next(model.transmissions(views, ("water",)))
     primary = transmission.images(chords[None], model.system.mas)[0]
-    scatter = [mph.xray_scatter(body, views, model, precision=0.005, seed=seed).images for seed in (1, 2)]
+    scatter = [mph.xray_scatter(body, views, model, histories=150_000, seed=seed).images[0] for seed in (1, 2)]
+    scatter = [sum(np.rot90(image + image.T, k) for k in range(4))[None] / 8 for image in scatter]
     slices = mph.Grid.centered((36, 36, 1), 4.0)
     radius = np.hypot(*(np.indices((36, 36)) - 17.5)) * 4
 
@@ -215,9 +221,10 @@ def test_fdk_of_a_sphere_is_right_when_the_scatter_is_subtracted():
     without = values(primary, 0.0)
     assert without == pytest.approx([MU, MU], rel=0.01)
     measured = values(primary + scatter[0], 0.0)
-    assert measured[0] < 0.93 * measured[1]  # cupping
+    assert measured[0] < 0.95 * measured[1]  # cupping
     assert measured[0] < 0.85 * without[0]
-    np.testing.assert_allclose(values(primary + scatter[0], scatter[1]), without, rtol=0.01)
+    corrected = values(primary + scatter[0], scatter[1])
+    np.testing.assert_allclose(corrected, without, rtol=0.01)
 
 
 def test_what_is_missing_or_wrong_is_said_in_one_line():

@@ -216,7 +216,7 @@ def _rounds(
             histories.seen[:] = 0
         count = histories.followed // _ROUNDS
         excess = (_relative_error(rounds) / precision) ** 2 - 1
-        more = 0 if given is not None or excess < 0.1 else math.ceil(count * min(excess, 100.0))
+        more = 0 if given is not None or excess < 0.1 else math.ceil(count * min(excess, 15.0))
     return rounds, histories.followed
 
 

@@ -38,6 +38,7 @@ def _starts(rng: np.random.Generator, size: Array) -> Array:
     starts["direction"] = direction / np.linalg.norm(direction, axis=1, keepdims=True)
     starts["energy"] = rng.choice([30.0, 60.0, 140.5, 150.0], PHOTONS)
     starts["collides_at"] = rng.choice([1e-12, 1e-6, 0.5, 1 - 1e-12], PHOTONS)
+    starts["weight"] = rng.choice([0.5, 1.0, 2.0], PHOTONS)
     return starts
 
 

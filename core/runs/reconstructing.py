@@ -94,7 +94,8 @@ def reconstruct_run(
     InputWarning
         The run was simulated with voxels that are not half as large as those of the reconstruction, or with no better model
         of the hole: model and data then share errors that real data do not have (inverse crime). The whole hole cannot be
-        modelled, and few rays replace it. The record of a run without a recipe contradicts the given model.
+        modelled, and few rays replace it. The record of a run without a recipe contradicts the given model. The run's
+        simulated scatter is not corrected.
     """
     recipe = reconstruction_recipe(run, recipe)
     method = method or method_of(recipe["reconstruction.method"])
@@ -115,6 +116,12 @@ def reconstruct_run(
     flatters = inverse_crime_notes(run, grid, model)
     for text in flatters:
         warn(text, 2)
+    if run.scatter is not None and recipe["reconstruction.scatter"] == "none":
+        share = run.scatter.sum(dtype=float) / max(run.projections.sum(dtype=float), 1e-30)
+        warn(
+            f"{share:.0%} of the counts are scatter that nothing corrects; reconstruction.scatter = body estimates it",
+            2,
+        )
     if recipe["reconstruction.ignore_attenuation"]:
         mu = None
     A = projector_of_run(run, grid, mu, model, recipe["compute.backend"], recipe["compute.threads"], stages)

@@ -208,15 +208,15 @@ def _rounds(
     cells = math.prod(cone.bins)
     histories = Histories(body, cone, cone.panel, energies, response, np.zeros(0), cells, orders, seed, 1, False)
     rounds = np.zeros((_ROUNDS, orders, *cone.bins))
-    more = _PILOT if given is None else -(-given // _ROUNDS)
-    while more:
+    missing = _PILOT if given is None else -(-given // _ROUNDS)
+    while missing:
         for sums in rounds:
-            histories.run(more)
+            histories.run(missing)
             sums += histories.seen.reshape(sums.shape)
             histories.seen[:] = 0
         count = histories.followed // _ROUNDS
         excess = (_relative_error(rounds) / precision) ** 2 - 1
-        more = 0 if given is not None or excess < 0.1 else math.ceil(count * min(excess, 15.0))
+        missing = 0 if given is not None or excess < 0.1 else math.ceil(count * min(excess, 15.0))
     return rounds, histories.followed
 
 

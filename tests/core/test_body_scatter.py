@@ -28,7 +28,7 @@ def biases(study, draws, ways):
 
 @pytest.mark.long
 def test_regions_of_a_torso_are_as_with_the_true_scatter():
-    found = biases(STUDY["Study"](), 10, (BODY, WINDOWS[0], NONE))
+    found = biases(STUDY["Study"](), 2, (BODY, WINDOWS[0], NONE))
     assert (abs(found[BODY]) < 0.02).all(), found
     assert (found[NONE] > 0.15).all() and (abs(found[BODY]) < abs(found[WINDOWS[0]])).all(), found
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import warnings
+
 import numpy as np
 import pytest
 
@@ -117,3 +119,14 @@ def test_each_event_has_its_own_scatter_however_often_it_is_made(tmp_path):
     assert not np.array_equal(*scatter)
     wrong = with_scatter.replace('scatter.model = "body"\nscatter.precision = 0.1', 'scatter = "body"')
     refused(lambda: small_recipe(tmp_path / "wrong", wrong), "scatter", 'scatter.model = "body"')
+
+
+def test_scatter_that_nothing_corrects_is_said(run):
+    recipe = run.recipe.updated({"reconstruction.voxels": [8], "reconstruction.spacing": 16.0,
+                                 "reconstruction.iterations": 2, "reconstruction.subsets": 1})  # fmt: skip
+    with pytest.warns(mph.InputWarning, match=r"\d+% of the counts are scatter that nothing corrects"):
+        mph.reconstruct_run(run, recipe)
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        mph.reconstruct_run(run, recipe.updated({"reconstruction.scatter": "body"}))
+    assert not any("nothing corrects" in str(warning.message) for warning in said)

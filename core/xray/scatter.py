@@ -56,7 +56,7 @@ def xray_scatter(
     threads: int | None = None,
     progress: Progress | None = None,
 ) -> XrayScatter:
-    """Simulate the photons of X-ray tubes that are scattered in a body before they meet the panel.
+    """Compute the images of photons of X-ray tubes that are scattered in a body before they meet the panel.
 
     The views are exposed one after another, without a grid. Photons leave each focal spot within the cone to its own panel,
     with the energies of the tube's spectrum behind its filters, and are followed as by `scatter_images`. At each collision

@@ -337,6 +337,15 @@ def test_stale_runs_are_said_and_compared_in_the_window(window, work_folder):
     assert letters.sum() > 100, "a line below the picture says it, and the tile's corner, in this colour"
 
 
+def test_scattered_photons_are_shown_apart_in_the_window(window, work_folder):
+    seen = window("scatter")
+    assert seen["shown"] == ["SCATTER"]
+    assert seen["PRIMARY"] + seen["SCATTER"] == pytest.approx(seen["ALL"], rel=1e-4)
+    assert 0.05 < seen["SCATTER"] / seen["ALL"] < 0.6
+    pictures = [pixels(path) for path in sorted(work_folder.glob("*.png")) if path.stem in ("primary", "scatter")]
+    assert len(pictures) == 2 and np.abs(np.subtract(*pictures, dtype=float)).max() > 50, "the mosaic has changed"
+
+
 SIZE = "360x240"
 
 

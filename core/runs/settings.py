@@ -233,10 +233,10 @@ _DECLARED = (
         "body": ("In the Body", "Simulated in the attenuation by Monte Carlo; takes an isotope and an energy resolution"),
     }, needs=(_COUNTS, _MADE), option="--scatter"),
     Setting("scatter.precision", float, 0.005, "Standard deviation of each module's total of scattered photons, as a share "
-            "of it; half of it takes four times as long", above=0, most=0.5, slider=0.05, needs=("scatter.model=body",),
-            option="--scatter-precision", label="Precision"),
+            "of it; half of it takes four times as long", above=0, most=0.5, slider=0.05,
+            needs=(_COUNTS, "scatter.model=body"), option="--scatter-precision", label="Precision"),
     Setting("scatter.seed", int, 0, "Seed of the simulation of scatter; of several states or frames SEED, SEED + 1 …",
-            least=0, most=2**31 - 1, needs=("scatter.model=body",), option="--scatter-seed", label="Scatter Seed"),
+            least=0, most=2**31 - 1, needs=(_COUNTS, "scatter.model=body"), option="--scatter-seed", label="Scatter Seed"),
     Setting("detector.plane", str, "virtual", "Plane of the images", label="Detector", option="--detector", words={
         "virtual": ("Virtual", "Plane in front of the pinhole: upright, as the module's camera sees it"),
         "real": ("Real", "Front face of the crystal behind the pinhole: point-inverted"),

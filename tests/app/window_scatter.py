@@ -17,7 +17,7 @@ def water() -> bpy.types.Object:
 
 def shown_sum() -> float:
     """Return the sum of the projection of module 30 that the scene holds."""
-    return float(images.projection_array(bpy.data.images["Projection 30"]).sum())
+    return float(images.projection_array(bpy.data.images["mphDRR 30"]).sum())
 
 
 def steps():
@@ -26,7 +26,9 @@ def steps():
     yield from idle()
     settings = bpy.context.scene.mphdrr_projections
     settings.volume = runs.projected_volume(bpy.context.scene)
+    settings.model, settings.time = "EMISSION", 600.0
     settings.mu, settings.isotope, settings.energy_fwhm = water(), "Tc-99m", 0.1
+    settings.mu.hide_set(True)  # it would hide the phantom
     settings.scatter, settings.scatter_precision = "BODY", 0.02
     settings.width = settings.height = 48
     editor()[1].spaces.active.show_region_ui = True

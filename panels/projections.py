@@ -13,7 +13,7 @@ from .sidebar import Folded, Popover, draw_text
 _MAIN = ("model", "time", "hole", "height", "width")
 """Settings that beginners need, which the panel itself shows."""
 _PHYSICS = (
-    "photons", "isotope", "panel", "window", "sensor", "sensor_thickness", "materials",
+    "photons", "isotope", "panel", "window", "energy_fwhm", "sensor", "sensor_thickness", "materials",
     "aperture_material", "aperture_mu", "crystal_material", "crystal_mu",
     "intrinsic_fwhm", "background",
 )  # fmt: skip

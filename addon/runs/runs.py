@@ -145,8 +145,8 @@ def parts_to_show(scene: bpy.types.Scene) -> list[tuple[str, str, bool]]:
     """Return identifier and label of each part of the shown run's photons, and whether it is shown; none without scatter."""
     if run_settings(scene).get("scatter.model", "none") == "none" or ids.MOSAIC not in bpy.data.images:
         return []
-    shown = bpy.data.images[ids.MOSAIC].get(images.PHOTONS, "all")
-    return [(part.upper(), label, part == shown) for part, label in PHOTONS.items()]
+    shown_part = bpy.data.images[ids.MOSAIC].get(images.PHOTONS, "all")
+    return [(part.upper(), label, part == shown_part) for part, label in PHOTONS.items()]
 
 
 def required_run(scene: bpy.types.Scene, action: str) -> bpy.types.PropertyGroup:

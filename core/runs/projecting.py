@@ -84,9 +84,9 @@ class Imaging:
             return None
         model: Any = self.model
         body = scattering_body(model) if mu is None else Volume(mu, volume.grid, "mu")
-        precision, seed = self.scatter.precision, self.scatter.seed + number
+        A, precision, seed = self.projector, self.scatter.precision, self.scatter.seed + number
         return scatter_images(
-            volume, body, self.projector.views, model, precision=precision, seed=seed, progress=progress
+            volume, body, A.views, model, precision=precision, seed=seed, threads=A.threads, progress=progress
         ).images[0]
 
     def recorded_shares(self, images: Floats32) -> Floats32:

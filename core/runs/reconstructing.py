@@ -116,12 +116,12 @@ def reconstruct_run(
     flatters = inverse_crime_notes(run, grid, model)
     for text in flatters:
         warn(text, 2)
-    if run.scatter is not None and recipe["reconstruction.scatter"] == "none":
-        share = run.scatter.sum(dtype=float) / max(run.projections.sum(dtype=float), 1e-30)
-        warn(
-            f"{share:.0%} of the counts are scatter that nothing corrects; reconstruction.scatter = body estimates it",
-            2,
-        )
+    has_scatter = "recipe" in run.settings and run.recipe["scatter.model"] != "none"
+    if has_scatter and recipe["reconstruction.scatter"] == "none":
+        share = "some"  # an event does not hold it apart
+        if run.scatter is not None:
+            share = f"{run.scatter.sum(dtype=float) / max(run.projections.sum(dtype=float), 1e-30):.0%}"
+        warn(f"{share} of the counts are scatter that nothing corrects; reconstruction.scatter = body estimates it", 2)
     if recipe["reconstruction.ignore_attenuation"]:
         mu = None
     A = projector_of_run(run, grid, mu, model, recipe["compute.backend"], recipe["compute.threads"], stages)

@@ -123,7 +123,7 @@ def scatter_images(
     ------
     InputError
         The model has no isotope or no energy resolution, a volume holds another quantity or values below 0, a window is
-        not two ascending energies, or lines are beyond the tables.
+        not two ascending energies, or all lines are below 30 keV or one is beyond the tables.
 
     References
     ----------
@@ -199,6 +199,8 @@ class _Run:
         self._views, self._model, self._windows, self._threads = views, model, windows, threads
         isotope: Any = model.isotope
         lines = [line for line in (*isotope.lines, *isotope.weak_lines) if line[0] > LOWEST_ENERGY]
+        if not lines:
+            raise InputError(f"scatter: expected photons above {LOWEST_ENERGY:g} keV; {isotope.name} has none")
         self._reference = strongest_line(model)
         self._body, self._source = Body.of(body, self._reference), PhotonSource.of(activity, lines)
         self._energies = self._table_energies(max(energy for energy, _ in lines), spectra)

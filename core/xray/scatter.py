@@ -109,7 +109,7 @@ def xray_scatter(
         raise InputError(f"scatter: model: expected the materials {WATER_AND_BONE!r}, got {model.materials!r}")
     model.check(views)
     orders = strict_whole(orders, "scatter: orders", "1 or more")
-    given = None if histories is None else strict_whole(histories, "scatter: histories", "1 or more")
+    histories = None if histories is None else strict_whole(histories, "scatter: histories", "1 or more")
     precision = positive(precision, "scatter: precision")
     require(4.0 * (2 * orders + 2) * len(views) * math.prod(views.shape), f"scatter in {len(views)} panels")
     voxels, seed, threads = Body.of(body, CT_ENERGY), seed_number(seed), thread_count(threads)
@@ -120,7 +120,7 @@ def xray_scatter(
         spectrum, energies, response = tables[m]
         cone = _Cone(views, m, spectrum)
         view_seed = int(np.random.SeedSequence([seed, m]).generate_state(1, np.uint64)[0])
-        rounds, count = _rounds(voxels, cone, energies, response, orders, view_seed, given, precision)
+        rounds, count = _rounds(voxels, cone, energies, response, orders, view_seed, histories, precision)
         along_v, along_u = (_pixel_shares(bins, pixels) for bins, pixels in zip(cone.bins, views.shape, strict=True))
         scale = cone.photons * model.system.mas[m] / (count / _ROUNDS)
         variance = rounds.sum(axis=1).var(axis=0, ddof=1) / _ROUNDS
@@ -201,14 +201,14 @@ def _rounds(
     response: Floats32,
     orders: int,
     seed: int,
-    given: int | None,
+    wanted_histories: int | None,
     precision: float,
 ) -> tuple[Floats, int]:
     """Return the sums (rounds, orders, rows, columns) of the bins, for a photon per history, and the number of histories."""
     cells = math.prod(cone.bins)
     histories = Histories(body, cone, cone.panel, energies, response, np.zeros(0), cells, orders, seed, 1, False)
     rounds = np.zeros((_ROUNDS, orders, *cone.bins))
-    missing = _PILOT if given is None else -(-given // _ROUNDS)
+    missing = _PILOT if wanted_histories is None else -(-wanted_histories // _ROUNDS)
     while missing:
         for sums in rounds:
             histories.run(missing)
@@ -216,7 +216,7 @@ def _rounds(
             histories.seen[:] = 0
         count = histories.followed // _ROUNDS
         excess = (_relative_error(rounds) / precision) ** 2 - 1
-        missing = 0 if given is not None or excess < 0.1 else math.ceil(count * min(excess, 15.0))
+        missing = 0 if wanted_histories is not None or excess < 0.1 else math.ceil(count * min(excess, 15.0))
     return rounds, histories.followed
 
 

@@ -286,5 +286,8 @@ def test_what_is_missing_or_wrong_is_said_in_one_line(small):
     refused(lambda: mph.scatter_images(activity, body, views, optics, windows=[(154, 126)]), "two ascending energies")
     refused(lambda: mph.scatter_images(activity, body, views, optics, histories=0), "histories")
     refused(lambda: mph.scatter_images(activity, body, views, optics, precision=-1.0), "precision")
+    soft = mph.Isotope("soft", 1e4, ((25.0, 1.0),))
+    low = mph.Emission(system, isotope=soft, energy_fwhm=0.1)
+    refused(lambda: mph.scatter_images(activity, body, views, low), "above 30 keV; soft has none")
     negative = mph.Volume(-body.array, body.grid, "mu")
     refused(lambda: mph.scatter_images(activity, negative, views, optics), "0 or more")

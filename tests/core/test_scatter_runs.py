@@ -117,6 +117,11 @@ def test_each_event_has_its_own_scatter_however_often_it_is_made(tmp_path):
     assert all(0.02 < part.sum() / image.sum() < 0.5 for part, image in zip(scatter, plain, strict=True))
     np.testing.assert_array_equal(plain[0], plain[1])  # nothing else differs
     assert not np.array_equal(*scatter)
+    event = mph.events.make(recipe, tmp_path / "set", 1)[0]
+    changes = {"reconstruction.voxels": [8], "reconstruction.iterations": 1, "reconstruction.subsets": 1}
+    drawn = event.run("emission", noise_seed=1)
+    with pytest.warns(mph.InputWarning, match="some of the counts are scatter that nothing corrects"):
+        mph.reconstruct_run(drawn, drawn.recipe.updated(changes))
     wrong = with_scatter.replace('scatter.model = "body"\nscatter.precision = 0.1', 'scatter = "body"')
     refused(lambda: small_recipe(tmp_path / "wrong", wrong), "scatter", 'scatter.model = "body"')
 

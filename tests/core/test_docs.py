@@ -141,6 +141,7 @@ array, index = np.ones((32, 32, 128)), points
     "phantoms": "sources, targets = [[0, 0, 200]], [[0, 0, -200]]",
     "reconstruction": """
 import scipy.sparse.linalg
+mu = mph.Volume(np.full(grid.shape, 0.015), grid, "mu")
 liver = volume.array > 0
 def progress(done, total):
     if 2 * done > total:
@@ -149,6 +150,11 @@ expected, volumes = mph.read_run("run.h5").projections, np.ones((1, 2, 16, 16, 1
 truth = mph.Volume(volume.array, mph.Grid.centered(16, 6.0))
 mph.write_volume(truth, "truth.nii.gz")
 mph.write_volume(mph.read_volume("heart.nii.gz"), "volume.nii.gz")
+""",
+    "scatter": """
+import dataclasses
+x = mph.read_scanner("both.xlsx", "x-ray")[[0]]
+ct = mph.Volume(np.zeros((8, 8, 8)), mph.Grid.centered(8, 5.0), "hu")
 """,
     "volumes": """
 import shutil

@@ -67,7 +67,7 @@ def test_spectra_of_photons_that_leave_a_slab_are_those_of_goupil():
     views, model = far(np.stack([sine * np.cos(turn), sine * np.sin(turn), cosine], axis=1))
     grid, activity = mph.Grid.centered((100, 100, 20), 10.0), point(-20.0)
     water = mph.Volume(np.full(grid.shape, MU, np.float32), grid, "mu")
-    found = mph.scatter_images(activity, water, views, model, windows=[(30, 154)], precision=0.004, spectra=True)
+    found = mph.scatter_images(activity, water, views, model, windows=[(30, 154)], precision=0.002, spectra=True)
     emitted = mph.Projector(activity.grid, views, model)(activity).sum(axis=(1, 2))
     step = found.energies[1] - found.energies[0]
     ends = np.append(found.energies - step / 2, found.energies[-1] + step / 2)

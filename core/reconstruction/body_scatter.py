@@ -52,13 +52,12 @@ def estimate_scatter(
 ) -> Floats32:
     """Return the expected scatter (M, n_v, n_u) in a body of activity like `values` in the voxels `inside` it.
 
-    Its size is such that this activity's images and their scatter together are the `expected` counts of all pixels. So
-    neither the size of a volume that still explains scatter matters, nor what of it lies in the air.
+    Its size is such that the images of all `values` and the scatter together are the `expected` counts of all pixels. So
+    the size of a volume that still explains scatter does not matter.
     """
-    values = np.where(inside, values, np.float32(0))
     model: Any = A.model
     scatter = scatter_images(
-        Volume(values, A.grid, "activity"), body, A.views, model, precision=_PRECISION, threads=A.threads,
+        Volume(np.where(inside, values, np.float32(0)), A.grid, "activity"), body, A.views, model, precision=_PRECISION, threads=A.threads,
         progress=progress,
     ).images[0]  # fmt: skip
     total = np.sum(A(values), dtype=float) + np.sum(scatter, dtype=float)

@@ -16,7 +16,7 @@ from ..volumes.volume import Volume
 from .body import Body, coefficients, momentum_tables
 
 _STEPS = (1 / 1.1347241384015194) ** np.arange(1, 6)  # 5 dimensions: powers of the root of x^6 = x + 1
-_HISTORIES_AT_ONCE = 2048  # of a piece of work: its collisions are some MB
+_HISTORIES_AT_ONCE = 2048  # of a piece of work: its collisions are a MB
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,7 +40,7 @@ class PhotonSource:
         if values.min(initial=0.0) < 0:
             raise InputError(f"scatter: activity: expected 0 or more, got {values.min():g}")
         voxels = np.argwhere(values)
-        bits = np.arange(20)
+        bits = np.arange(max(activity.grid.shape).bit_length())
         interleaved = ((voxels[:, None, :] >> bits[:, None] & 1) << (3 * bits[:, None] + np.array([2, 1, 0]))).sum(
             axis=(1, 2)
         )
@@ -135,6 +135,7 @@ class Histories:
         self._kernels, self._threads = _kernels(), threads
         self._source = source
         self.seen = np.zeros((orders, accepted.shape[1], cells, len(modules)), np.float32)
+        self.totals = np.zeros((accepted.shape[1], len(modules)))  # photons that pass the holes and are counted
         self.spectra = np.zeros((len(modules), len(energies))) if spectra else None
         self.followed = 0
         tables = momentum_tables()
@@ -142,11 +143,19 @@ class Histories:
         to_index[:, 3] += 0.5  # voxel i fills [i, i + 1)
         self._arrays = [
             body.densities, coefficients(energies), tables.incoherent, tables.coherent, tables.coherent_until,
-            modules, np.ascontiguousarray(accepted, np.float32), np.ascontiguousarray(cell_of, np.int32), self.seen,
+            modules, np.ascontiguousarray(accepted, np.float32), _worth(accepted, spectra),
+            np.ascontiguousarray(cell_of, np.int32), self.seen, self.totals,
         ]  # fmt: skip  # they live as long as the jobs that point at them
         names = (
             *("body", "coefficients", "incoherent", "coherent", "coherent_until"),
-            *("panel" if modules.dtype == self._kernels.PANEL else "holes", "accepted", "cell_of", "seen"),
+            *(
+                "panel" if modules.dtype == self._kernels.PANEL else "holes",
+                "accepted",
+                "worth",
+                "cell_of",
+                "seen",
+                "totals",
+            ),
         )
         numbers = {name: array.ctypes.data for name, array in zip(names, self._arrays, strict=True)}
         step = float(energies[1] - energies[0])
@@ -185,7 +194,7 @@ class Histories:
         end = first + len(starts)  # none where nothing is active
         begins = first
         while first < end:
-            collisions = np.empty(8 * (end - first) + self._kernels.MOST_COLLISIONS, self._kernels.COLLISION)
+            collisions = np.empty(3 * (end - first) + self._kernels.MOST_COLLISIONS, self._kernels.COLLISION)
             numbers = np.zeros(2, np.int64)
             followed, n_collisions = (numbers[i:].ctypes.data for i in (0, 1))
             job = self._kernels.PhotonJob(
@@ -203,6 +212,13 @@ class Histories:
         job.first_module, job.last_module = first, end
         see = self._kernels.library.see_panel if job.panel else self._kernels.library.see
         see(self._kernels.level, ctypes.byref(job))
+
+
+def _worth(accepted: Floats32, spectra: bool) -> Floats32:
+    """Return how much photons (M, n) of the energies matter: the largest share that is counted there or at the next energies."""
+    largest = np.ones_like(accepted[:, 0]) if spectra else accepted.max(axis=1)
+    edges = np.pad(largest, ((0, 0), (1, 1)), "edge")
+    return np.ascontiguousarray(np.maximum(np.maximum(edges[:, :-2], edges[:, 2:]), largest), np.float32)
 
 
 def _kernels() -> Any:

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 from time import perf_counter
 from typing import Any
 
@@ -32,8 +33,10 @@ from .histories import Histories, PhotonSource
 _ENERGIES = 512  # of the tables
 _LEAST_SHARE = 1e-4  # of the photons of an energy that a window counts: below it they are not followed
 _CELL, _MOST_CELLS = 5.0, 150_000  # least side, mm, and number of the cells whose collisions a module sees as one
-_PARTS, _ROUNDS = 4, 4  # parts by whose differences deviations are known, and rounds of each for those of totals
-_PILOT = 1024  # histories of a round of the trial
+_PARTS, _ROUNDS = 4, 32  # parts by whose differences deviations are known, and rounds of each for those of totals
+_PILOT = 8192  # histories of the trial
+_TOGETHER = 8  # modules whose emissions are copied at once
+_LEAST = 8.0  # contributions below so many times the mean of a history are seen at random
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,7 +150,7 @@ def scatter_images(
     run = _Run(activity, body, views, model, chosen, orders, spectra, seed_number(seed), thread_count(threads))
     if histories is not None:
         count = strict_whole(histories, "scatter: histories", "1 or more")
-        run.follow(-(-count // (_PARTS * _ROUNDS)), progress)
+        run.follow(count, progress)
     else:
         run.follow_until(positive(precision, "scatter: precision"), progress)
     return run.result()
@@ -206,7 +209,6 @@ class _Run:
         self._energies = self._table_energies(max(energy for energy, _ in lines), spectra)
         cell_of, self._cells = _cells(self._body.grid)
         self._modules = _modules(views, model, float(np.linalg.norm(self._cells.spacing)))
-        self._sensitivity = _sensitivity(self._modules, self._cells)
         orders = strict_whole(orders, "scatter: orders", "1 or more")
         numbers = orders * len(windows) * len(views) * (self._cells.n_voxels + 3 * math.prod(views.shape))
         require(4.0 * numbers, f"scatter into {len(windows)} windows of {len(views)} modules")
@@ -226,23 +228,28 @@ class _Run:
         stages, start = stages_of(progress), perf_counter()
         self._follow_rounds(_PILOT, stages("trying scatter"))
         seconds = (perf_counter() - start) / self._histories.followed
-        self._histories.seen[:] = 0
-        self._modules["least"] = np.max(np.mean(self._rounds, axis=0), axis=0)
-        needed = self._needed(_PILOT, precision)
-        self._rounds, self._counts = [], []
-        for _ in range(3):  # the trial's deviations are not exact
-            count = needed * _PARTS * _ROUNDS
-            self.follow(needed, stages(f"scattering {count} photons, some {max(count * seconds, 1):.0f} s"))
-            so_far = self._count // (_PARTS * _ROUNDS)
-            missing = self._needed(so_far, precision) - so_far
-            if missing * 8 < needed:
-                return
-            needed = missing
+        self._modules["least"] = _LEAST * np.max(np.mean(self._rounds, axis=0), axis=0)
+        needed = self._needed(precision)
+        self._histories.seen[:], self._rounds, self._counts = 0, [], []
+        followed = stages(f"scattering {needed} photons, some {max(needed * seconds, 1):.0f} s")
+        for k in range(
+            _PARTS
+        ):  # few rounds have too large a deviation among those of many modules: each part knows better
+            if k == 0 or needed > self._count:
+                self._follow_part((needed - self._count) / (_PARTS - k), part_of(followed, k, _PARTS))
+                needed = self._needed(precision)
+        if self._count < 0.9 * needed:
+            self._follow_part(needed - self._count, stages(f"scattering {needed - self._count} photons more"))
 
-    def _needed(self, count: int, precision: float) -> int:
-        """Return the number of histories of each of 16 rounds that a precision takes, by those of `count` so far."""
+    def follow(self, count: int, progress: Progress | None) -> None:
+        """Run at least `count` histories."""
+        for k in range(_PARTS):
+            self._follow_part(count / _PARTS, part_of(progress, k, _PARTS))
+
+    def _needed(self, precision: float) -> int:
+        """Return the number of histories that a precision takes, by those so far, of which there are at least `_PILOT`."""
         error = float(self._errors()[0].max(initial=0.0))
-        return max(math.ceil(count * min((error / precision) ** 2, 1e4)), 16)
+        return max(math.ceil(sum(self._counts) * min((error / precision) ** 2, 1e4)), _PILOT)
 
     def _errors(self) -> Floats:
         """Return the relative standard deviations (W, M) of the modules' totals, by the differences of rounds."""
@@ -252,41 +259,41 @@ class _Run:
         error = np.sqrt(squares / (len(rounds) - 1))
         return np.divide(error, mean, out=np.zeros_like(mean), where=mean > 0)
 
-    def follow(self, count: int, progress: Progress | None) -> None:
-        """Run `count` histories in each round of some parts, and add these to the mean image and its variance.
+    def _follow_part(self, count: float, progress: Progress | None) -> None:
+        """Run at least `count` histories, and add what is seen of them to the mean image and its variance.
 
         By D. H. D. West, Communications of the ACM 22 (1979) 532, with the histories of a part as its weight.
         """
-        new = _ROUNDS * count
-        for k in range(_PARTS):
-            self._follow_rounds(count, part_of(progress, k, _PARTS), _ROUNDS)
-            off = self._project(self._histories.seen) / new - self._mean
-            self._histories.seen[:] = 0
-            self._parts, self._count = self._parts + 1, self._count + new
-            self._mean += off * (new / self._count)
-            self._squares += off.sum(axis=0) ** 2 * (new * (1 - new / self._count))
+        new = self._follow_rounds(count, progress)
+        off = self._project(self._histories.seen) / new - self._mean
+        self._histories.seen[:] = 0
+        self._parts, self._count = self._parts + 1, self._count + new
+        self._mean += off * (new / self._count)
+        self._squares += off.sum(axis=0) ** 2 * (new * (1 - new / self._count))
 
-    def _follow_rounds(self, count: int, progress: Progress | None, rounds: int = _PARTS * _ROUNDS) -> None:
-        """Run rounds of `count` histories, and keep their totals."""
-        last_total = 0.0
-        for k in range(rounds):
-            self._histories.run(count, part_of(progress, k, rounds))
-            total = np.einsum("owcm,cm->wm", self._histories.seen, self._sensitivity)
-            self._rounds.append((total - last_total) / count)
-            self._counts.append(count)
-            last_total = total
+    def _follow_rounds(self, count: float, progress: Progress | None) -> int:
+        """Run rounds of at least `count` histories together, keep their totals, and return the number of histories."""
+        each = math.ceil(count / _ROUNDS)
+        for k in range(_ROUNDS):
+            self._histories.totals[:] = 0
+            self._histories.run(each, part_of(progress, k, _ROUNDS))
+            self._rounds.append(self._histories.totals / each)
+            self._counts.append(each)
+        return _ROUNDS * each
 
     def _project(self, weights: Array) -> Array:
         """Return the images (orders, W, M, n_v, n_u) of what the modules saw, for one history."""
-        scale = self._source.photons / self._cells.voxel_volume
+        scale = np.float32(self._source.photons / self._cells.voxel_volume)
         images = np.empty(self._mean.shape, np.float32)
 
-        def project(m: int) -> None:
+        def project(first: int) -> None:
+            modules = range(first, min(first + _TOGETHER, len(self._views)))
             for order, window in np.ndindex(images.shape[:2]):
-                emission = weights[order, window, :, m].reshape(self._cells.shape) * scale
-                images[order, window, m] = self._projectors[m](emission)[0] if emission.any() else 0
+                emissions = np.ascontiguousarray(weights[order, window, :, modules.start : modules.stop].T)
+                for m, emission in zip(modules, emissions.reshape(-1, *self._cells.shape), strict=True):
+                    images[order, window, m] = self._projectors[m](emission)[0] * scale if emission.any() else 0
 
-        for _ in in_order(project, range(len(self._views)), self._threads):
+        for _ in in_order(project, range(0, len(self._views), _TOGETHER), self._threads):
             pass
         return images
 
@@ -360,10 +367,10 @@ def _optics_ratio(model: Emission, energies: Floats) -> Floats:
                     ) ** 2
     if optics.crystal_mu is not None:
         usual = np.broadcast_to(optics.crystal_mu, len(system))
+        mu_of = cache(lambda name: np.array([attenuation(name, energy) for energy in energies]))
         for m in range(len(system)):
             if name := system.crystal_material[m] or _crystal_of(model, float(usual[m])):
-                mu = np.array([attenuation(name, energy) for energy in energies])
-                ratio[m] *= np.expm1(-mu * thickness[m]) / np.expm1(-usual[m] * thickness[m])
+                ratio[m] *= np.expm1(-mu_of(name) * thickness[m]) / np.expm1(-usual[m] * thickness[m])
     return ratio
 
 
@@ -407,22 +414,6 @@ def _modules(views: Views, model: Emission, cell: float) -> Array:
             1.5 * diameters[m] + cell, spread / model.system.collimator_length[m], 0.0, diameters[m] ** 2 / 16, 0.0,
         )  # fmt: skip
     return modules
-
-
-def _sensitivity(modules: Array, cells: Grid) -> Floats32:
-    """Return the shares of the photons (cells, M) that a module's hole passes from the middle of each cell it sees."""
-    index = np.indices(cells.shape).reshape(3, -1)
-    places = (cells.affine[:3, :3] @ index + cells.affine[:3, 3:]).T
-    result = np.zeros((len(places), len(modules)), np.float32)
-    for m, module in enumerate(modules):
-        to = places - module["hole"]
-        height = to @ module["axis"]
-        slopes = (to @ module[side] / np.where(height > 0, height, np.inf) for side in "uv")
-        is_seen = height > 0
-        for slope, low, high in zip(slopes, module["slopes"][::2], module["slopes"][1::2], strict=True):
-            is_seen &= (slope > low) & (slope < high)
-        result[:, m] = np.where(is_seen, module["area"] * height / np.maximum(np.linalg.norm(to, axis=1), 1e-9) ** 3, 0)
-    return result
 
 
 def _smoothed(variance: Array) -> Array:

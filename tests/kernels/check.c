@@ -118,9 +118,10 @@ static void run_photons(int64_t level) {
     job.body = taken(voxels * MATERIALS * 4), job.coefficients = taken(3 * tables * 4);
     job.incoherent = taken(momenta * 4), job.coherent = taken(momenta * 4), job.coherent_until = taken(momenta * 4);
     job.starts = taken((end - job.all_first) * sizeof(Start)), job.holes = taken(job.modules * sizeof(Module));
-    job.accepted = taken(job.modules * job.windows * job.energies * 4), job.cell_of = taken(voxels * 4);
+    job.accepted = taken(job.modules * job.windows * job.energies * 4), job.worth = taken(job.modules * job.energies * 4), job.cell_of = taken(voxels * 4);
     job.collisions = block(job.capacity * sizeof(Collision)), job.seen = block(seen * 4);
     job.followed = block(8), job.n_collisions = block(8);
+    if (job.totals) job.totals = block(job.windows * job.modules * 8);
     if (job.spectra) job.spectra = block(job.modules * job.energies * 8);
     int64_t collisions = 0;
     for (job.first = job.all_first; job.first < (int64_t)end; job.first = *job.followed) {

@@ -81,8 +81,8 @@ def _job(rng: np.random.Generator, number: int, alike: list[bool]) -> Made:
         followed=numbers.ctypes.data, n_collisions=numbers[1:].ctypes.data,
         capacity=int(rng.choice([MOST_COLLISIONS, MOST_COLLISIONS + 1, 2000])),
     )  # fmt: skip
-    densities, *tables = histories._arrays[:5]
-    data = packed("photons", number // 6, job, densities, *tables, starts, modules, accepted, cell_of)
+    densities, *tables, _, shares, worth, cells_of, _, _ = histories._arrays
+    data = packed("photons", number // 6, job, densities, *tables, starts, modules, shares, worth, cells_of)
     collisions, total = _computed(histories, job)
 
     def check(read: Read) -> None:

@@ -23,7 +23,7 @@ from ..ray_geometry import Attenuation, IndexFans, IndexRays, Rays
 LEVEL_VARIABLE = "MPHDRR_CPU_LEVEL"
 """Environment variable with the name of a lower level of processor, of `levels`, than this one's."""
 
-_CONTRACT = 12
+_CONTRACT = 13
 _NAMES = {"win32": "siddon.dll", "darwin": "libsiddon.dylib"}
 _MAX_VOXELS = 2**31 - 1  # their indices have 32 bits
 _PRODUCT = 2  # in kernels.h
@@ -95,9 +95,9 @@ class PhotonJob(Structure):
         ("coherent_until", c_void_p), ("seed", c_uint64), ("all_first", c_int64), ("first", c_int64),
         ("last", c_int64), ("starts", c_void_p), ("collisions", c_void_p), ("capacity", c_int64),
         ("followed", c_void_p), ("n_collisions", c_void_p), ("holes", c_void_p), ("modules", c_int64),
-        ("first_module", c_int64), ("last_module", c_int64), ("accepted", c_void_p), ("windows", c_int64),
-        ("orders", c_int64), ("cell_of", c_void_p), ("cells", c_int64), ("seen", c_void_p), ("spectra", c_void_p),
-        ("panel", c_void_p),
+        ("first_module", c_int64), ("last_module", c_int64), ("accepted", c_void_p), ("worth", c_void_p),
+        ("windows", c_int64), ("orders", c_int64), ("cell_of", c_void_p), ("cells", c_int64), ("seen", c_void_p),
+        ("totals", c_void_p), ("spectra", c_void_p), ("panel", c_void_p),
     ]  # fmt: skip
 
 

@@ -18,7 +18,7 @@
 
 #define NODE_ROWS 4
 #define GIVEN_ROWS 16
-#define CONTRACT 12 // increased with every change of the code of this file: cpu.py refuses any other
+#define CONTRACT 13 // increased with every change of the code of this file: cpu.py refuses any other
 
 // Voxels (n[0], n[1], n[2]) in C order, float or double as the job says.
 typedef struct {
@@ -182,10 +182,12 @@ typedef struct {
     const Module *holes;               // (modules)
     int64_t modules, first_module, last_module;
     const float *accepted;             // (modules, windows, energies): shares of the photons that are counted
+    const float *worth;                // (modules, energies): importance of photons, above 0 where any window counts them
     int64_t windows, orders;
     const int32_t *cell_of;            // cells of the body's voxels
     int64_t cells;
     float *seen;                       // (orders, windows, cells, modules): photons of an even emission that would be seen alike
+    double *totals;                    // (windows, modules): photons that pass the hole and are counted; or null
     double *spectra;                   // (modules, energies): photons that pass the hole; or null
     const Panel *panel;                // of see_panel, the only module
 } PhotonJob;

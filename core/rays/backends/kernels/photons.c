@@ -114,28 +114,33 @@ INLINE double walk(const PhotonJob *job, const double *place, const double *dire
         next[a] = slope[a] != 0 ? MAX((slope[a] > 0 ? 1 - at[a] : at[a]) * delta[a], 0.0f) : FAR;
     }
     const int64_t strides[3] = {job->n[1] * job->n[2], job->n[2], 1};
+    int64_t here = 0, steps[3], room[3]; // of each axis, the step to the next voxel, and how many of them are ahead
+    for (int a = 0; a < 3; a++) {
+        here += index[a] * strides[a], steps[a] = slope[a] > 0 ? strides[a] : -strides[a];
+        room[a] = slope[a] > 0 ? job->n[a] - 1 - index[a] : index[a];
+    }
     const float end = (float)(leave - enter);
-    float t = 0;
+    float t = 0, left = depth, water = 0, bone = 0;
     for (;;) {
-        const int64_t here = index[0] * strides[0] + index[1] * strides[1] + index[2];
-        const int axis = next[0] < next[1] ? (next[0] < next[2] ? 0 : 2) : (next[1] < next[2] ? 1 : 2);
-        const float stop = MIN(next[axis], end), length = MAX(stop - t, 0.0f);
+        const int x = (next[0] < next[1]) & (next[0] < next[2]), y = !x & (next[1] < next[2]), z = !(x | y);
+        const float stop = MIN(MIN(MIN(next[0], next[1]), next[2]), end), length = MAX(stop - t, 0.0f);
         const float *densities = job->body + MATERIALS * here;
-        const float rate = densities[0] * mu[0] + densities[1] * mu[1];
-        if (rate * length >= *depth_left) {
-            const float part = *depth_left / rate;
-            paths[0] += densities[0] * part, paths[1] += densities[1] * part;
+        const float lost = (densities[0] * mu[0] + densities[1] * mu[1]) * length;
+        if (lost >= left) {
+            const float part = length * left / lost;
+            paths[0] = water + densities[0] * part, paths[1] = bone + densities[1] * part;
             *depth_left = 0, *voxel = here;
             return enter + t + part;
         }
-        *depth_left -= rate * length;
-        paths[0] += densities[0] * length, paths[1] += densities[1] * length;
+        left -= lost, water += densities[0] * length, bone += densities[1] * length;
         t = stop;
-        if (!(t < end)) return limit;
-        next[axis] += delta[axis];
-        index[axis] += slope[axis] > 0 ? 1 : -1;
-        if (index[axis] < 0 || index[axis] >= job->n[axis]) return limit;
+        room[0] -= x, room[1] -= y, room[2] -= z;
+        if (!(t < end) | ((room[0] | room[1] | room[2]) < 0)) break;
+        next[0] += x ? delta[0] : 0, next[1] += y ? delta[1] : 0, next[2] += z ? delta[2] : 0;
+        here += x ? steps[0] : y ? steps[1] : steps[2];
     }
+    *depth_left = left, paths[0] = water, paths[1] = bone;
+    return limit;
 }
 
 // --- collisions ----------------------------------------------------------------------------------------------------------------
@@ -292,66 +297,225 @@ INLINE Sight towards(const PhotonJob *job, const Collision *c, const double *to)
     return sight;
 }
 
-// The largest share of photons of this energy that any window of a module counts.
-INLINE float counted(const PhotonJob *job, int64_t m, Between at) {
-    float most = job->spectra ? 1 : 0;
-    for (int64_t w = 0; w < job->windows; w++) {
-        const float share = in(job->accepted + (m * job->windows + w) * job->energies, at);
-        most = MAX(most, share);
-    }
-    return most;
+// Where a module's number in a window is among those of a collision's cell.
+INLINE float *place_of(const PhotonJob *job, const Collision *c, int64_t window, int64_t cell, int64_t m) {
+    const int64_t order = MIN(c->order, job->orders) - 1;
+    return job->seen + ((order * job->windows + window) * job->cells + cell) * job->modules + m;
 }
 
-INLINE void record(const PhotonJob *job, const Collision *c, int64_t m, int64_t cell, double energy, float weight, double spectral) {
+INLINE void record(const PhotonJob *job, const Collision *c, int64_t m, int64_t cell, double energy, float weight, double passes) {
     const Between at = energy_place(job, energy);
-    const int64_t orders = job->orders, order = c->order < orders ? c->order - 1 : orders - 1;
     const float *accepted = job->accepted + m * job->windows * job->energies;
     for (int64_t w = 0; w < job->windows; w++) {
-        float *sum = job->seen + ((order * job->windows + w) * job->cells + cell) * job->modules + m;
-        *sum += weight * in(accepted + w * job->energies, at);
+        const float counted = weight * in(accepted + w * job->energies, at);
+        *place_of(job, c, w, cell, m) += counted;
+        if (job->totals) job->totals[w * job->modules + m] += counted * passes;
     }
-    if (job->spectra) job->spectra[m * job->energies + at.first + (at.share > 0.5f)] += weight * spectral;
+    if (job->spectra) job->spectra[m * job->energies + at.first + (at.share > 0.5f)] += weight * passes;
 }
 
-// Record the photons of a weight that a collision scatters along a way through the body, with the energies they then have.
-INLINE void record_sight(const PhotonJob *job, const Collision *c, const Before *before, const Sight *sight, const double *to,
-                         double distance, int64_t m, int64_t cell, float weight, double spectral) {
-    float paths[MATERIALS], left;
-    int64_t voxel;
-    walk(job, c->place, to, distance, sight->mu_after, FAR, paths, &left, &voxel);
+// Record the photons of a weight that a collision scatters along a way whose paths through the materials are given, mm.
+INLINE void record_sight(const PhotonJob *job, const Collision *c, const Before *before, const Sight *sight, const float *paths,
+                         int64_t m, int64_t cell, float weight, double passes) {
     const float after = exponential(-(paths[0] * sight->mu_after[0] + paths[1] * sight->mu_after[1]));
     const float kept = exponential(-(paths[0] * before->mu[0] + paths[1] * before->mu[1]));
-    record(job, c, m, cell, sight->after, weight * sight->compton * after, spectral);
-    record(job, c, m, cell, c->energy, weight * sight->rayleigh * kept, spectral);
+    record(job, c, m, cell, sight->after, weight * sight->compton * after, passes);
+    record(job, c, m, cell, c->energy, weight * sight->rayleigh * kept, passes);
+}
+
+// Modules that look at a collision together, one in each lane.
+enum { LANES = 8, GROUPS = 8 };
+typedef float F __attribute__((ext_vector_type(LANES)));
+typedef double D __attribute__((ext_vector_type(LANES)));
+typedef int32_t I __attribute__((ext_vector_type(LANES)));
+#define EACH_LANE(i) _Pragma("clang loop unroll(full)") for (int i = 0; i < LANES; i++)
+#define AS(type, x) __builtin_convertvector(x, type)
+#define ROOT(x) __builtin_elementwise_sqrt(x)
+
+typedef struct {
+    D hole[3];
+    F u[3], v[3], axis[3], slopes[4], margin, margin_by_height, nearest, area, least, shift;
+    const float *worth[LANES];
+} Group;
+
+INLINE void assemble(const PhotonJob *job, int64_t first, Group *group) {
+    *group = (Group){0}; // lanes without a module see through holes of no area
+    EACH_LANE(i) {
+        const int64_t m = MIN(first + i, job->last_module - 1);
+        const Module *module = &job->holes[m];
+        for (int a = 0; a < 3; a++) {
+            group->hole[a][i] = module->hole[a], group->axis[a][i] = (float)module->axis[a];
+            group->u[a][i] = (float)module->u[a], group->v[a][i] = (float)module->v[a];
+        }
+        for (int a = 0; a < 4; a++) group->slopes[a][i] = (float)module->slopes[a];
+        group->margin[i] = (float)module->margin, group->margin_by_height[i] = (float)module->margin_by_height;
+        group->nearest[i] = (float)module->nearest, group->area[i] = first + i == m ? (float)module->area : 0;
+        group->least[i] = (float)module->least, group->worth[i] = job->worth + m * job->energies;
+        group->shift[i] = (float)((double)m * 0.6180339887498949 - (double)(int64_t)((double)m * 0.6180339887498949));
+    }
+}
+
+INLINE F at_each(const float *table, I index) {
+    F values;
+    EACH_LANE(i) values[i] = table[index[i]];
+    return values;
+}
+
+// About how many photons a collision scatters through each module's hole and into a window, if nothing stops them: by the tables'
+// nearest numbers. It is above 0 wherever some are counted.
+INLINE F expected(const PhotonJob *job, const Group *group, const Collision *c, const Before *before) {
+    F to[3];
+    for (int a = 0; a < 3; a++) to[a] = AS(F, group->hole[a] - c->place[a]);
+    F height = 0, u = 0, v = 0, along = 0, square = 0;
+    for (int a = 0; a < 3; a++) {
+        height -= to[a] * group->axis[a], u -= to[a] * group->u[a], v -= to[a] * group->v[a];
+        along += to[a] * (float)c->direction[a], square += to[a] * to[a];
+    }
+    const F *slopes = group->slopes;
+    const F beside = MAX(MAX(height * slopes[0] - u, u - height * slopes[1]), MAX(height * slopes[2] - v, v - height * slopes[3]));
+    const I sees = (height > group->nearest) & (beside < group->margin + group->margin_by_height * height) & (group->area > 0);
+    if (!__builtin_reduce_or(sees)) return 0;
+    const F distance = ROOT(MAX(square, (F)1e-12f)), cosine = MIN(MAX(along / distance, (F)-1), (F)1);
+    const float energy = (float)c->energy;
+    const F ratio = 1 / (1 + energy / (float)ELECTRON * (1 - cosine)), after = energy * ratio;
+    const F x = energy * (float)MOMENTUM * ROOT(0.5f * (1 - cosine));
+    const I momentum = MIN(AS(I, ROOT(x) * (float)job->momenta_per_root) + 1, (I)(int32_t)(job->momenta - 1));
+    const F last = (float)(job->energies - 1);
+    const I loses = AS(I, MIN(MAX((after - (float)job->lowest) * (float)job->energies_per_kev, (F)0), last) + 0.5f);
+    F incoherent = 0, coherent = 0, worth_after, worth_before;
+    for (int a = 0; a < MATERIALS; a++) {
+        const float density = job->body[MATERIALS * c->voxel + a];
+        if (density == 0) continue;
+        incoherent += density * at_each(job->incoherent + a * job->momenta, momentum);
+        coherent += density * at_each(job->coherent + a * job->momenta, momentum);
+    }
+    const int64_t now = before->energy.first + (before->energy.share > 0.5f);
+    EACH_LANE(i) worth_after[i] = group->worth[i][loses[i]], worth_before[i] = group->worth[i][now];
+    const F compton = incoherent * ratio * ratio * (ratio + 1 / ratio - 1 + cosine * cosine);
+    const F passes = group->area * height / (distance * distance * distance);
+    const F photons = c->weight * (float)(4 * PI) / before->total * passes;
+    return sees ? photons * (compton * worth_after + coherent * (1 + cosine * cosine) * worth_before) : 0;
+}
+
+// A module's look at a collision, if it is drawn.
+typedef struct {
+    const Collision *c;
+    Before before;
+    Sight sight;
+    double to[3], distance, passes; // passes: share of the photons that pass the hole
+    int64_t m;
+    float weight, chance, drawn; // the look is drawn if `drawn` is below the chance times what remains of the photons on the way
+} Look;
+
+// Walk from collisions to modules through the body, until the optical depth is `depth`; see `walk`. Return what is missing of it.
+INLINE F walk_together(const PhotonJob *job, const Look *looks, int n, F depth, F *paths) {
+    D start[3], speed[3], enter = 0, leave = 0;
+    F mu[MATERIALS];
+    EACH_LANE(i) {
+        const Look *look = &looks[MIN(i, n - 1)];
+        leave[i] = look->distance;
+        for (int a = 0; a < 3; a++) {
+            const double *row = job->index_from_world[a];
+            start[a][i] = dot(row, look->c->place) + row[3], speed[a][i] = dot(row, look->to);
+        }
+        for (int a = 0; a < MATERIALS; a++) mu[a][i] = look->sight.mu_after[a];
+    }
+    const int64_t strides[3] = {job->n[1] * job->n[2], job->n[2], 1};
+    for (int a = 0; a < 3; a++) {
+        const D slow = speed[a] == 0 ? (D)1e-30 : speed[a]; // along an axis
+        const D first = (0 - start[a]) / slow, last = ((double)job->n[a] - start[a]) / slow;
+        enter = MAX(enter, MIN(first, last)), leave = MIN(leave, MAX(first, last));
+        speed[a] = slow;
+    }
+    F next[3], delta[3], t = 0, end = AS(F, leave - enter), left = depth;
+    I here = 0, steps[3], room[3];
+    for (int a = 0; a < 3; a++) {
+        const D entry = MIN(MAX(start[a] + enter * speed[a], (D)0.0), (D)((double)job->n[a] - 0.5));
+        const I index = AS(I, entry), ahead = AS(I, speed[a] > 0);
+        const F at = AS(F, entry - AS(D, index));
+        delta[a] = AS(F, 1 / __builtin_elementwise_abs(speed[a]));
+        next[a] = (ahead ? 1 - at : at) * delta[a];
+        here += index * (int32_t)strides[a], steps[a] = ahead ? (I)(int32_t)strides[a] : (I)(int32_t)-strides[a];
+        room[a] = ahead ? (int32_t)(job->n[a] - 1) - index : index;
+    }
+    paths[0] = paths[1] = 0;
+    I walks = end > 0;
+    while (__builtin_reduce_or(walks)) {
+        const I x = (next[0] < next[1]) & (next[0] < next[2]), y = ~x & (next[1] < next[2]), z = ~(x | y);
+        const F stop = MIN(MIN(MIN(next[0], next[1]), next[2]), end), length = walks ? MAX(stop - t, (F)0) : 0;
+        F water, bone;
+        EACH_LANE(i) water[i] = job->body[MATERIALS * here[i]], bone[i] = job->body[MATERIALS * here[i] + 1];
+        left -= (water * mu[0] + bone * mu[1]) * length;
+        paths[0] += water * length, paths[1] += bone * length;
+        t = stop;
+        room[0] += x, room[1] += y, room[2] += z; // true is -1
+        walks &= (t < end) & (left > 0) & ((room[0] | room[1] | room[2]) >= 0);
+        next[0] += x ? delta[0] : 0, next[1] += y ? delta[1] : 0, next[2] += z ? delta[2] : 0;
+        here += walks & (x ? steps[0] : y ? steps[1] : steps[2]);
+    }
+    return left;
+}
+
+static void look_together(const PhotonJob *job, const Look *looks, int n) {
+    F depth = FAR, paths[MATERIALS];
+    for (int i = 0; i < n; i++)
+        if (looks[i].drawn > 0) depth[i] = (float)depth_of(looks[i].drawn / looks[i].chance);
+    const F left = walk_together(job, looks, n, depth, paths);
+    for (int i = 0; i < n; i++) {
+        const Look *look = &looks[i];
+        if (!(left[i] > 0)) continue;
+        const float way[MATERIALS] = {paths[0][i], paths[1][i]};
+        const float remains = exponential(-(way[0] * look->sight.mu_after[0] + way[1] * look->sight.mu_after[1]));
+        const float weight = look->weight / MIN(look->chance * remains, 1.0f);
+        record_sight(job, look->c, &look->before, &look->sight, way, look->m, job->cell_of[look->c->voxel], weight, look->passes);
+    }
+}
+
+INLINE void see_all(const PhotonJob *job, int64_t first, int64_t end) {
+    Group groups[GROUPS];
+    Look looks[LANES];
+    int n_looks = 0;
+    const int64_t n = (end - first + LANES - 1) / LANES;
+    for (int64_t g = 0; g < n; g++) assemble(job, first + g * LANES, &groups[g]);
+    for (const Collision *c = job->collisions; c < job->collisions + *job->n_collisions; c++) {
+        const Before before = before_collision(job, c);
+        union { double value; uint64_t bits; } place = {c->place[0]};
+        Random random = mixed(place.bits);
+        const float number = (float)uniform(&random);
+        for (int64_t g = 0; g < n; g++) {
+            const Group *group = &groups[g];
+            const F most = expected(job, group, c, &before);
+            F drawn = number + group->shift; // a random number for each module
+            drawn = MAX(drawn - AS(F, AS(I, drawn)), (F)1e-7f);
+            const I are_drawn = (most > 0) & (drawn * group->least < most); // few photons are not worth the walk every time
+            if (!__builtin_reduce_or(are_drawn)) continue;
+            for (int i = 0; i < LANES; i++) {
+                if (!are_drawn[i]) continue;
+                Look *look = &looks[n_looks++];
+                const int64_t m = first + g * LANES + i, cell = job->cell_of[c->voxel];
+                for (int64_t w = 0; w < job->windows; w++) __builtin_prefetch(place_of(job, c, w, cell, m), 1);
+                const int plays = group->least[i] > 0;
+                *look = (Look){.c = c, .before = before, .m = m, .weight = c->weight * (float)(4 * PI) / before.total,
+                               .chance = plays ? most[i] / group->least[i] : FAR, .drawn = plays ? drawn[i] : 0};
+                const Module *module = &job->holes[m];
+                for (int a = 0; a < 3; a++) look->to[a] = module->hole[a] - c->place[a];
+                const double height = -dot(look->to, module->axis), u = -dot(look->to, module->u), v = -dot(look->to, module->v);
+                const double *slopes = module->slopes;
+                const int inside = u > height * slopes[0] && u < height * slopes[1] && v > height * slopes[2] && v < height * slopes[3];
+                look->distance = __builtin_sqrt(dot(look->to, look->to));
+                look->passes = inside ? module->area * height / (look->distance * look->distance * look->distance) : 0;
+                for (int a = 0; a < 3; a++) look->to[a] /= look->distance;
+                look->sight = towards(job, c, look->to);
+                if (n_looks == LANES) look_together(job, looks, n_looks), n_looks = 0;
+            }
+        }
+    }
+    if (n_looks) look_together(job, looks, n_looks);
 }
 
 void KERNEL(see)(const PhotonJob *job) {
-    for (const Collision *c = job->collisions; c < job->collisions + *job->n_collisions; c++) {
-        const Before before = before_collision(job, c);
-        for (int64_t m = job->first_module; m < job->last_module; m++) {
-            const Module *module = &job->holes[m];
-            double to[3];
-            for (int i = 0; i < 3; i++) to[i] = module->hole[i] - c->place[i];
-            const double height = -dot(to, module->axis), u = -dot(to, module->u), v = -dot(to, module->v);
-            const double margin = module->margin + module->margin_by_height * height;
-            const double outside = MAX(MAX(height * module->slopes[0] - u, u - height * module->slopes[1]),
-                                       MAX(height * module->slopes[2] - v, v - height * module->slopes[3]));
-            if (!(height > module->nearest && outside < margin)) continue;
-            const double distance = __builtin_sqrt(dot(to, to));
-            for (int i = 0; i < 3; i++) to[i] /= distance;
-            const Sight sight = towards(job, c, to);
-            float weight = c->weight * (float)(4 * PI) / before.total;
-            const double passes = module->area * height / (distance * distance * distance);
-            const double most = weight * passes * (sight.compton * counted(job, m, sight.loses) + sight.rayleigh * counted(job, m, before.energy));
-            if (most < module->least || most <= 0) { // few photons: not worth the walk every time
-                union { double value; uint64_t bits; } place = {c->place[0]};
-                Random random = mixed(place.bits ^ mixed((uint64_t)m + 1));
-                if (uniform(&random) * module->least >= most) continue;
-                weight *= (float)(module->least / most);
-            }
-            record_sight(job, c, &before, &sight, to, distance, m, job->cell_of[c->voxel], weight, outside < 0 ? passes : 0);
-        }
-    }
+    for (int64_t first = job->first_module; first < job->last_module; first += GROUPS * LANES)
+        see_all(job, first, MIN(first + GROUPS * LANES, job->last_module));
 }
 
 void KERNEL(see_panel)(const PhotonJob *job) {
@@ -372,7 +536,10 @@ void KERNEL(see_panel)(const PhotonJob *job) {
             const Sight sight = towards(job, c, to);
             const double angle = seen / (distance * distance * distance * (double)panel->places);
             const int64_t cell = (int64_t)(v * (double)panel->rows) * panel->columns + (int64_t)(u * (double)panel->columns);
-            record_sight(job, c, &before, &sight, to, distance, 0, cell, c->weight * (float)angle / before.total, 0);
+            float paths[MATERIALS], left;
+            int64_t voxel;
+            walk(job, c->place, to, distance, sight.mu_after, FAR, paths, &left, &voxel);
+            record_sight(job, c, &before, &sight, paths, 0, cell, c->weight * (float)angle / before.total, 0);
         }
     }
 }

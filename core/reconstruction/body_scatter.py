@@ -56,9 +56,9 @@ def estimate_scatter(
     the size of a volume that still explains scatter does not matter.
     """
     model: Any = A.model
+    activity = Volume(np.where(inside, values, np.float32(0)), A.grid, "activity")
     scatter = scatter_images(
-        Volume(np.where(inside, values, np.float32(0)), A.grid, "activity"), body, A.views, model, precision=_PRECISION, threads=A.threads,
-        progress=progress,
-    ).images[0]  # fmt: skip
+        activity, body, A.views, model, precision=_PRECISION, threads=A.threads, progress=progress
+    ).images[0]
     total = np.sum(A(values), dtype=float) + np.sum(scatter, dtype=float)
     return scatter * np.float32(max(0.0, expected) / max(total, 1e-30))

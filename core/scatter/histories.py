@@ -215,7 +215,7 @@ class Histories:
 
 
 def _worth(accepted: Floats32, spectra: bool) -> Floats32:
-    """Return how much photons (M, n) of the energies matter: the largest share that is counted there or at the next energies."""
+    """Return how much photons (M, n) matter: the largest share that is counted at their energy or at its neighbours."""
     largest = np.ones_like(accepted[:, 0]) if spectra else accepted.max(axis=1)
     edges = np.pad(largest, ((0, 0), (1, 1)), "edge")
     return np.ascontiguousarray(np.maximum(np.maximum(edges[:, :-2], edges[:, 2:]), largest), np.float32)

@@ -24,6 +24,7 @@ from ..runs.recipe import Recipe
 from ..runs.run_recipe import recipe_model
 from ..runs.settings import SETTINGS
 from ..validation import one_of
+from ..volumes.volume import Volume
 from ..workbook import read_system
 from .objectives import Detail, Lesion, Regions, Sensitivity, ball_points
 from .parameters import FreeParameters, check_generator, displacement_parameters, free_parameters
@@ -73,6 +74,10 @@ _ROWS = settings_by_key((
     Setting("pareto.y", str, "sensitivity", "Column of the table for the plot's vertical axis"),
     Setting("evaluation.body", str, None, "Phantom (.toml), or its text, that is imaged and reconstructed"),
     Setting("evaluation.lesion", str, None, "A lesion in it, whose SNR is the score", "the score is NRMSE"),
+    Setting("evaluation.scatter", str, "none", "Photons that the body scatters", words={
+        "none": ("None", "The body neither scatters nor attenuates"),
+        "body": ("In the Body", "By the body's mu; reconstructions know both"),
+    }),
     Setting("evaluation.draws", int, 20, "Draws of noise", least=2),
     Setting("evaluation.iterations", int, 10, "Iterations of OSEM", least=1),
     Setting("evaluation.subsets", int, None, "Subsets of OSEM", "as many as suit", least=1),
@@ -165,16 +170,16 @@ class DesignRecipe(Values):
         n_coarse = -(-n // coarse)
         return Grid.centered(n_coarse, self["imaging.spacing"] * n / n_coarse)
 
-    def projector(self, system: PinholeSystem, coarse: int = 1) -> Projector:
+    def projector(self, system: PinholeSystem, coarse: int = 1, mu: Volume | None = None) -> Projector:
         """Return the projector of a system, whose images cover the whole crystals, with pixels `coarse` times as large."""
         n = max(2, self["imaging.pixels"] // coarse)
-        return Projector(self.grid(coarse), system.views((n, n), "real"), self.model(system))
+        return Projector(self.grid(coarse), system.views((n, n), "real"), replace(self.model(system), mu=mu))
 
-    def volumes(self, phantom: str, apart: bool = False, coarse: int = 1) -> list[Array]:
+    def volumes(self, phantom: str, apart: bool = False, coarse: int = 1, quantity: str = "activity") -> list[Array]:
         """Return the voxels of a phantom, named by its file or given as text: the whole, or `apart` each of its shapes."""
         parsed = parse_phantom(phantom, "phantom") if "\n" in phantom else read_phantom(self.folder / phantom)
         phantoms = [ShapePhantom([shape]) for shape in parsed.shapes] if apart else [parsed]
-        return [item.voxelize(self.grid(coarse)).array for item in phantoms]
+        return [item.voxelize(self.grid(coarse), quantity=quantity).array for item in phantoms]
 
     def wanted(self, coarse: int = 1) -> list[Any]:
         """Return the objectives as functions of a system, with voxels and pixels `coarse` times as large."""

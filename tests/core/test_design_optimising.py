@@ -10,6 +10,7 @@ import pytest
 
 import mphdrr.core as mph
 from mphdrr.core.cli import main
+from mphdrr.core.design import evaluating
 from mphdrr.core.design.numbers import module_rows
 from mphdrr.core.design.objectives import Detail, Lesion, Regions, Sensitivity, ball_points
 from mphdrr.core.design.optimising import DesignLoss
@@ -27,6 +28,7 @@ from mphdrr.core.design.recipe import TEMPLATE
 from mphdrr.core.geometry.system import PinholeSystem
 from mphdrr.core.projector import Projector
 
+from .conftest import refused
 from .small_design import BODY, PARTS, RECIPE, TEXT, small_design
 
 pytest.importorskip("scipy", reason="SciPy is not installed")
@@ -274,6 +276,28 @@ def test_the_gain_is_judged_by_draws_of_noise():
     assert gain.score == "lesion SNR" and gain.gain > 0
     same = mph.design.evaluate(recipe, start, start)
     assert same.low < 0 < same.high
+
+
+def test_the_gain_is_judged_with_the_body_s_attenuation_and_scatter(monkeypatch):
+    told = []
+
+    def keep(A, counts, iterations, subsets, background):
+        told.append((A, counts, background))
+        return mph.osem(A, counts, iterations, subsets, background=background)
+
+    monkeypatch.setattr(evaluating, "osem", keep)
+    evaluation = {"body": BODY + "mu = 0.0154\n", "scatter": "body", "draws": 2, "iterations": 1, "subsets": 1}
+    recipe = small_design(evaluation=evaluation, model={"time": 600.0, "isotope": "Tc-99m", "energy_fwhm": 0.1})
+    start = recipe.parameters.build(recipe.parameters.start)
+    mph.design.evaluate(recipe, start, start)
+    A, counts, background = told[0]
+    (values,) = recipe.volumes(BODY)
+    primary = A(values).sum()
+    assert primary < 0.9 * recipe.projector(start)(values).sum()
+    assert 0.02 * primary < background.sum() < primary
+    assert counts.sum() == pytest.approx(primary + background.sum(), abs=5 * counts.sum() ** 0.5)
+    without = small_design(evaluation={**evaluation, "body": BODY}, model={"isotope": "Tc-99m", "energy_fwhm": 0.1})
+    refused(lambda: mph.design.evaluate(without, start, start), "evaluation.scatter: the body scatters nothing")
 
 
 def test_the_template_is_a_recipe_that_begins_with_a_scanner_that_passes(tmp_path, capsys):

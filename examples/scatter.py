@@ -38,7 +38,7 @@ def main(workbook: Path, folder: Path) -> None:
     A = mph.Projector(grid, views, model)
 
     primary = A(activity)
-    found = mph.scatter_images(activity, mu, views, model, windows=list(WINDOWS.values()), precision=0.02, spectra=True)
+    found = mph.scatter_images(activity, mu, views, model, windows=list(WINDOWS.values()), precision=0.004, spectra=True)
     shares = peak_shares(model.isotope, (WINDOWS["120 to 126 keV"], model.window, WINDOWS["154 to 160 keV"]), 0.1)
     lower, peak, upper = (share / shares[1] for share in shares)
     for name, images, share in zip(WINDOWS, found.images, (peak, lower, upper), strict=True):
@@ -59,7 +59,7 @@ def main(workbook: Path, folder: Path) -> None:
     }
     regions = {"heart": activity.array > 0.9 * torso.myocardium, "body": abs(activity.array - torso.body) < 0.01}
     for way, arguments in ways.items():
-        volume = mph.osem(A, counts[0], 8, 5, **arguments).volume
+        volume = mph.osem(A, counts[0], 20, 2, **arguments).volume
         means = (f"{name} {volume.array[region].mean():.1f}" for name, region in regions.items())
         print(f"{way}: {', '.join(means)} kBq/mL")
 

@@ -38,7 +38,9 @@ def main(workbook: Path, folder: Path) -> None:
     A = mph.Projector(grid, views, model)
 
     primary = A(activity)
-    found = mph.scatter_images(activity, mu, views, model, windows=list(WINDOWS.values()), precision=0.004, spectra=True)
+    found = mph.scatter_images(
+        activity, mu, views, model, windows=list(WINDOWS.values()), precision=0.004, spectra=True
+    )
     shares = peak_shares(model.isotope, (WINDOWS["120 to 126 keV"], model.window, WINDOWS["154 to 160 keV"]), 0.1)
     lower, peak, upper = (share / shares[1] for share in shares)
     for name, images, share in zip(WINDOWS, found.images, (peak, lower, upper), strict=True):

@@ -102,7 +102,7 @@ def test_first_collisions_are_an_integral_over_the_body():
     system = mph.PinholeSystem(np.array([[0.0, 0.0, 200.0]]), 1.0, 60.0, 200.0, 9.0, 75.0)
     views, optics, place = system.views((40, 40), "real"), model(system, tolerance=0.002), np.array([6.0, 4.0, -3.0])
     found = mph.scatter_images(
-        point(place), water(grid), views, optics, windows=[WINDOWS[0]], orders=2, histories=1_600_000
+        point(place), water(grid), views, optics, windows=[WINDOWS[0]], orders=2, histories=4_800_000
     )
     u = (np.arange(400) + 0.5) / 400
     cosine, azimuth, step = np.meshgrid(2 * u - 1, 2 * np.pi * u[::4], (np.arange(60) + 0.5) / 60, indexing="ij")
